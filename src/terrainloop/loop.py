@@ -1,0 +1,50 @@
+"""What is known about one pair of submaps: the transform between them, the evidence, the decision."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class LoopCandidate:
+    """A pair of submaps that was compared; truthy where it was accepted as a loop closure.
+
+    Attributes
+    ----------
+    source, target : str
+        Names of the two submaps; source is the later one.
+    T_target_source : array, (4, 4)
+        Takes points of source into the frame of target, metres.
+    covariance : array, (6, 6)
+        Of (x, y, z, roll, pitch, yaw), the parameters of `T_target_source`, in metres and radians.
+        NaN where no transform could be estimated.
+    inliers : int
+        Associations that agree with the transform (n of Algorithm 1).
+    ssd : float
+        Weighted sum of squared gradient differences (h of Algorithm 1), m^-4.
+    ssd_ratio : float
+        `ssd` over what unrelated ground would give on the same overlap: 0 identical, 1 unrelated.
+    overlap : float
+        Shared part of the two maps' known ground, intersection over union, 0 to 1.
+    score : float
+        Higher is surer; comparable across the pairs of a mission.
+    accepted : bool
+    reason : str
+        In words, why it was accepted or not.
+    """
+
+    source: str
+    target: str
+    T_target_source: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    inliers: int
+    ssd: float
+    ssd_ratio: float
+    overlap: float
+    score: float
+    accepted: bool
+    reason: str
+
+    def __bool__(self) -> bool:
+        return self.accepted
