@@ -1,0 +1,64 @@
+"""Loop closures from the shape of the ground, by Gaussian-process gradient maps."""
+
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from terrainloop.config import Settings
+    from terrainloop.detection.detector import LoopDetector
+    from terrainloop.errors import TerrainLoopError
+    from terrainloop.gp.hyperparameters import fit_hyperparameters
+    from terrainloop.gp.kernel import Hyperparameters
+    from terrainloop.gradient_map import GradientMap
+    from terrainloop.io.clouds import read_cloud
+    from terrainloop.io.missions import Mission, load_mission
+    from terrainloop.loop import LoopCandidate
+    from terrainloop.matching.register import register
+    from terrainloop.submap import Submap
+
+_HOME = {
+    "GradientMap": "gradient_map",
+    "Hyperparameters": "gp.kernel",
+    "LoopCandidate": "loop",
+    "LoopDetector": "detection.detector",
+    "Mission": "io.missions",
+    "Settings": "config",
+    "Submap": "submap",
+    "TerrainLoopError": "errors",
+    "fit_hyperparameters": "gp.hyperparameters",
+    "load_mission": "io.missions",
+    "read_cloud": "io.clouds",
+    "register": "matching.register",
+}
+
+__all__ = [
+    "GradientMap",
+    "Hyperparameters",
+    "LoopCandidate",
+    "LoopDetector",
+    "Mission",
+    "Settings",
+    "Submap",
+    "TerrainLoopError",
+    "fit_hyperparameters",
+    "load_mission",
+    "read_cloud",
+    "register",
+]
+
+try:
+    __version__ = version("terrainloop")
+except PackageNotFoundError:  # run from a source tree that is not installed
+    __version__ = "unknown"
+
+
+def __getattr__(name: str) -> object:
+    # Loaded when first asked for, so that the command line answers --help at once.
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]

@@ -1,0 +1,139 @@
+"""Settings: few, in metres or dimensionless, derived from one another where they can be."""
+
+from pathlib import Path
+from typing import Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from terrainloop.errors import TerrainLoopError
+
+PresetName = Literal["default", "paper"]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class MapSettings(_Frozen):
+    """How a submap becomes a gradient map."""
+
+    max_points: int = Field(2500, ge=50, description="points kept per submap, drawn at random")
+    length_scale: float | None = Field(
+        None, gt=0, description="starting length scale of the kernel, m; null: twice the point spacing"
+    )
+    noise: float | None = Field(
+        None, gt=0, description="starting accuracy of the elevations, m; null: a fifth of the relief"
+    )
+    fit: Literal["database", "submap"] = Field(
+        "database", description="maximise the likelihood once (maps stay comparable) or for every submap"
+    )
+    resolution: float | None = Field(
+        None, gt=0, description="grid spacing, m per pixel; null: a sixth of the length scale"
+    )
+    remove_plane: bool = Field(True, description="take a plane out before, give its slope back after")
+    max_variance_ratio: float = Field(
+        0.25, gt=0, lt=1, description="ground is known where the variance is below this share of the prior's"
+    )
+
+
+class FeatureSettings(_Frozen):
+    """Keypoints on the gradient map."""
+
+    kind: Literal["surf", "sift", "orb"] = Field("sift", description="detector and descriptor")
+    max_keypoints: int = Field(500, ge=2, description="strongest keypoints kept per map")
+
+
+class MatchSettings(_Frozen):
+    """Algorithm 1: SE(2) RANSAC and its acceptance."""
+
+    mutual: bool = Field(True, description="associations must be nearest neighbours both ways")
+    iterations: int = Field(5000, ge=1, description="pairs of associations drawn")
+    inlier_radius: float | None = Field(
+        None, gt=0, description="largest distance of an inlier, m; null: half the length scale"
+    )
+    min_inliers: int = Field(5, ge=2, description="inliers that make a loop (n_min)")
+    max_ssd_ratio: float = Field(
+        1.0, gt=0, description="largest SSD, as a share of what unrelated ground would give"
+    )
+
+
+class Settings(_Frozen):
+    """Everything a run depends on; written beside every result."""
+
+    map: MapSettings = MapSettings()
+    features: FeatureSettings = FeatureSettings()
+    match: MatchSettings = MatchSettings()
+    skip_recent: int = Field(1, ge=0, description="submaps just before the query that are not compared")
+    seed: int = Field(0, ge=0, description="of every random draw")
+
+    @classmethod
+    def preset(cls, name: PresetName) -> "Settings":
+        """Settings by name: ``default``, or ``paper`` for the pipeline of Le Gentil et al. (2020).
+
+        Raises
+        ------
+        TerrainLoopError
+            For any other name.
+        """
+        if name == "default":
+            return cls()
+        if name == "paper":
+            return cls(
+                map=MapSettings(
+                    max_points=5000,
+                    length_scale=0.316,
+                    noise=0.02,
+                    fit="submap",
+                    resolution=0.03,
+                    remove_plane=False,
+                ),
+                features=FeatureSettings(kind="surf"),
+                match=MatchSettings(mutual=False),
+            )
+        raise TerrainLoopError(
+            expected="preset 'default' or 'paper'", found=repr(name), mend="name one of the two"
+        )
+
+    @classmethod
+    def from_yaml(cls, path: Path | str) -> "Settings":
+        """Read settings; what the file leaves out keeps its default.
+
+        Raises
+        ------
+        TerrainLoopError
+            If the file cannot be read, is no YAML mapping, or holds an unknown or impossible value.
+        """
+        mend = "start from the output of 'terrainloop config'"
+        try:
+            content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            raise TerrainLoopError(expected=f"YAML settings in {path}", found=_line(error), mend=mend) from error
+        try:
+            return cls.model_validate({} if content is None else content)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"]) or "the file"
+            raise TerrainLoopError(
+                expected=f"valid settings in {path}", found=f"{where}: {first['msg'].lower()}", mend=mend
+            ) from error
+
+    def to_yaml(self) -> str:
+        """The settings as YAML, each with its meaning as a comment."""
+        return "\n".join(_yaml_lines(self, "")) + "\n"
+
+
+def _yaml_lines(model: BaseModel, indent: str) -> list[str]:
+    lines = []
+    for name, field in type(model).model_fields.items():
+        value = getattr(model, name)
+        if isinstance(value, BaseModel):
+            lines += [f"{indent}{name}:  # {_line(type(value).__doc__)}", *_yaml_lines(value, indent + "  ")]
+        else:
+            scalar = "null" if value is None else yaml.safe_dump(value).removesuffix("...\n").strip()
+            lines.append(f"{indent}{name}: {scalar}  # {field.description}")
+    return lines
+
+
+def _line(text: object) -> str:
+    return " ".join(str(text).split())

@@ -1,0 +1,155 @@
+"""LoopDetector: submaps go in one by one, loop closures come out."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+from terrainloop.config import Settings
+from terrainloop.errors import TerrainLoopError
+from terrainloop.features import Features
+from terrainloop.gp.hyperparameters import fit_hyperparameters
+from terrainloop.gp.kernel import Hyperparameters
+from terrainloop.gradient_map import GradientMap
+from terrainloop.loop import LoopCandidate
+from terrainloop.matching.register import features_of, register
+from terrainloop.submap import Submap
+
+
+@dataclass(frozen=True, eq=False)
+class MappedSubmap:
+    """What is kept of a submap: its gradient map and the keypoints on it."""
+
+    name: str
+    gradient_map: GradientMap
+    features: Features
+
+
+class LoopDetector:
+    """Finds the earlier submaps that show the same place as a new one.
+
+    Parameters
+    ----------
+    settings : Settings, optional
+    parameters : Hyperparameters, optional
+        Of the Gaussian process, where they are known; else fitted as ``settings.map.fit`` says.
+    workers : int
+        Threads; the result does not depend on it.
+
+    Attributes
+    ----------
+    submaps : dict of str to MappedSubmap
+        The database, by name, in the order of arrival.
+    candidates : list of LoopCandidate
+        Every pair that was compared.
+
+    Examples
+    --------
+    >>> detector = LoopDetector()
+    >>> for submap in load_mission("mission/"):  # doctest: +SKIP
+    ...     for loop in detector.add(submap):
+    ...         print(loop.target, loop.source, loop.T_target_source)
+    """
+
+    def __init__(
+        self,
+        settings: Settings | None = None,
+        *,
+        parameters: Hyperparameters | None = None,
+        workers: int = 1,
+    ) -> None:
+        self.settings = settings or Settings()
+        self.parameters = parameters
+        self.workers = workers
+        self.submaps: dict[str, MappedSubmap] = {}
+        self.candidates: list[LoopCandidate] = []
+
+    def add(self, submap: Submap) -> list[LoopCandidate]:
+        """Map a submap, compare it with the earlier ones, store it.
+
+        Parameters
+        ----------
+        submap : Submap
+            Named unlike any before.
+
+        Returns
+        -------
+        list of LoopCandidate
+            The accepted loops; `candidates` holds the rejected pairs too.
+
+        Raises
+        ------
+        TerrainLoopError
+            If the name is taken or no map can be made; the database is then as it was.
+        """
+        if self.parameters is None and self.settings.map.fit == "database":
+            self.parameters = fit_database([submap], self.settings)
+        return self.add_mapped(map_submap(submap, self.settings, self.parameters, workers=self.workers))
+
+    def add_mapped(self, query: MappedSubmap) -> list[LoopCandidate]:
+        """As `add`, for a submap that is mapped already (see `map_submap`)."""
+        if query.name in self.submaps:
+            raise TerrainLoopError(
+                expected="a submap with a name of its own",
+                found=f"a second {query.name!r}",
+                mend="name each submap differently",
+            )
+        stored = list(self.submaps.values())[: max(0, len(self.submaps) - self.settings.skip_recent)]
+        with ThreadPoolExecutor(self.workers) as pool:
+            candidates = list(pool.map(partial(self._compare, query), stored))
+        self.submaps[query.name] = query
+        self.candidates += candidates
+        return [candidate for candidate in candidates if candidate]
+
+    def _compare(self, query: MappedSubmap, stored: MappedSubmap) -> LoopCandidate:
+        return register(
+            query.gradient_map,
+            stored.gradient_map,
+            self.settings,
+            source_features=query.features,
+            target_features=stored.features,
+            names=(query.name, stored.name),
+        )
+
+
+def fit_database(submaps: Sequence[Submap], settings: Settings, *, workers: int = 1) -> Hyperparameters:
+    """Hyperparameters for all maps of a database, so that they are comparable."""
+    return fit_hyperparameters(
+        submaps,
+        length_scale=settings.map.length_scale,
+        noise=settings.map.noise,
+        max_points=settings.map.max_points,
+        remove_plane=settings.map.remove_plane,
+        seed=settings.seed,
+        workers=workers,
+    )
+
+
+def map_submap(
+    submap: Submap, settings: Settings, parameters: Hyperparameters | None = None, *, workers: int = 1
+) -> MappedSubmap:
+    """The gradient map of a submap and its keypoints.
+
+    Parameters
+    ----------
+    submap : Submap
+    settings : Settings
+    parameters : Hyperparameters, optional
+        Of the database; without them they are fitted to this submap.
+    workers : int
+        Threads; the result does not depend on it.
+    """
+    parameters = parameters or fit_database([submap], settings)
+    gradient_map = GradientMap.from_points(
+        submap,
+        parameters.length_scale,
+        parameters.variance,
+        parameters.noise,
+        settings.map.resolution,
+        max_points=settings.map.max_points,
+        remove_plane=settings.map.remove_plane,
+        max_variance_ratio=settings.map.max_variance_ratio,
+        seed=settings.seed,
+        workers=workers,
+    )
+    return MappedSubmap(submap.name, gradient_map, features_of(gradient_map, settings))

@@ -1,0 +1,67 @@
+"""What the Gaussian process sees of a cloud: a few thousand points about a local origin."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from terrainloop.gp.kernel import Array, Hyperparameters
+from terrainloop.submap import Submap
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Training data: elevation = residual + centre_z + slope . (xy - centre_xy).
+
+    Attributes
+    ----------
+    xy : array, (N, 2)
+        Metres from the centre, so that no digit is lost to large (UTM) coordinates.
+    elevation : array, (N,)
+        Residual elevation, zero mean, metres.
+    centre : array, (3,)
+        Of the points, in the frame of the cloud, metres.
+    slope : array, (2,)
+        Of the plane that was taken out; zero where none was.
+    """
+
+    xy: Array
+    elevation: Array
+    centre: Array
+    slope: Array
+
+    @property
+    def spacing(self) -> float:
+        """Typical distance between neighbouring points, metres."""
+        return float(np.sqrt(np.prod(np.ptp(self.xy, axis=0)) / len(self.xy)))
+
+    def start(
+        self, length_scale: float | None, variance: float | None, noise: float | None
+    ) -> Hyperparameters:
+        """Hyperparameters to begin a search from, derived from the data where None."""
+        relief = float(self.elevation.std()) or 1e-3
+        return Hyperparameters(
+            length_scale=2 * self.spacing if length_scale is None else length_scale,
+            variance=relief**2 if variance is None else variance,
+            noise=0.2 * relief if noise is None else noise,
+        )
+
+
+def surface_of(points: ArrayLike, *, max_points: int, remove_plane: bool, seed: int) -> Surface:
+    """Draw at most `max_points` of the points (N, 3) at random and refer them to their centre.
+
+    Raises
+    ------
+    TerrainLoopError
+        If the points make no submap (see `Submap`).
+    """
+    cloud = points.points if isinstance(points, Submap) else Submap(points).points
+    if len(cloud) > max_points:
+        rng = np.random.default_rng(seed)
+        cloud = cloud[np.sort(rng.choice(len(cloud), max_points, replace=False))]
+    centre = cloud.mean(axis=0)
+    local = cloud - centre
+    slope = np.zeros(2)
+    if remove_plane:
+        slope = np.linalg.lstsq(local[:, :2], local[:, 2], rcond=None)[0]
+    return Surface(local[:, :2].copy(), local[:, 2] - local[:, :2] @ slope, centre, slope)

@@ -1,0 +1,41 @@
+"""Keypoint associations between two gradient maps, by brute force over descriptors."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from terrainloop.features import Features
+from terrainloop.geometry import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Associations:
+    """The set A of the paper: row i of `source` and of `target` may be the same spot of ground.
+
+    Both are (A, 2), metres, each in the frame of its own map.
+    """
+
+    source: Array
+    target: Array
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+
+def associate(source: Features, target: Features, *, mutual: bool) -> Associations:
+    """Pair each source keypoint with the target keypoint whose descriptor is nearest.
+
+    Parameters
+    ----------
+    source, target : Features
+        Of one kind. Distances are L2 for real and Hamming for binary (uint8) descriptors.
+    mutual : bool
+        Keep a pair only if each is the other's nearest.
+    """
+    if not len(source.positions) or not len(target.positions):
+        return Associations(np.empty((0, 2)), np.empty((0, 2)))
+    norm = cv2.NORM_HAMMING if source.descriptors.dtype == np.uint8 else cv2.NORM_L2
+    matches = cv2.BFMatcher(norm, crossCheck=mutual).match(source.descriptors, target.descriptors)
+    pairs = np.array([(m.queryIdx, m.trainIdx) for m in matches], dtype=int).reshape(-1, 2)
+    return Associations(source.positions[pairs[:, 0]], target.positions[pairs[:, 1]])

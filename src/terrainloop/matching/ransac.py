@@ -1,0 +1,103 @@
+"""Algorithm 1 of the paper: RANSAC on SE(2) over keypoint associations, verified on the maps."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrainloop.geometry import Array, fit_se2
+from terrainloop.gradient_map import GradientMap
+from terrainloop.matching.correspondences import Associations
+from terrainloop.matching.ssd import Ssd, compute_ssd
+
+CHUNK = 2_000_000  # distances evaluated at a time, which bounds memory
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """What Algorithm 1 returns: T, the inliers (n of them) and h."""
+
+    T_target_source: Array
+    inliers: NDArray[np.bool_]
+    ssd: Ssd
+
+
+def register_by_ransac(
+    source: GradientMap,
+    target: GradientMap,
+    associations: Associations,
+    *,
+    iterations: int,
+    inlier_radius: float,
+    max_ssd_ratio: float,
+    rng: np.random.Generator,
+) -> Alignment | None:
+    """Algorithm 1: the accepted transform that most associations agree with.
+
+    The loop of the paper keeps, over all draws, the transform with the most inliers among those
+    whose SSD is acceptable. Here draws are visited by falling inlier count, so that the first
+    acceptable one is that transform and h need not be computed for the rest.
+
+    Parameters
+    ----------
+    source, target : GradientMap
+    associations : Associations
+        The set A.
+    iterations : int
+        Pairs of associations drawn.
+    inlier_radius : float
+        Metres.
+    max_ssd_ratio : float
+        Largest `Ssd.ratio` of an acceptable transform.
+    rng : numpy.random.Generator
+        Source of the draws.
+
+    Returns
+    -------
+    Alignment or None
+        None if no draw has two inliers; if none is acceptable, the first draw with most inliers.
+    """
+    if len(associations) < 2:
+        return None
+    draws = select_random_associations(len(associations), iterations, rng)
+    T = fit_se2(associations.source[draws], associations.target[draws])
+    best = None
+    for inliers in _distinct_by_falling_count(associations, T, inlier_radius):
+        T_i = fit_se2(associations.source[inliers], associations.target[inliers])
+        alignment = Alignment(T_i, inliers, compute_ssd(source, target, T_i))
+        if alignment.ssd.ratio <= max_ssd_ratio:
+            return alignment
+        best = best or alignment
+    return best
+
+
+def select_random_associations(count: int, iterations: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """*SelectRandomAsso*: pairs (iterations, 2) of two different associations out of `count`."""
+    first = rng.integers(count, size=iterations)
+    second = (first + rng.integers(1, count, size=iterations)) % count
+    return np.stack([first, second], axis=1)
+
+
+def get_inliers(associations: Associations, T: Array, inlier_radius: float) -> NDArray[np.bool_]:
+    """*GetInliers*: (K, A), which associations each of the transforms (K, 3, 3) brings together."""
+    moved = associations.source @ T[:, :2, :2].transpose(0, 2, 1) + T[:, None, :2, 2]
+    return ((moved - associations.target) ** 2).sum(-1) <= inlier_radius**2
+
+
+def _distinct_by_falling_count(
+    associations: Associations, T: Array, inlier_radius: float
+) -> Iterator[NDArray[np.bool_]]:
+    """Inlier sets of two or more, largest first, in the order of the draws, none of them twice."""
+    step = max(1, CHUNK // len(associations))
+    chunks = (T[start : start + step] for start in range(0, len(T), step))
+    counts = np.concatenate([get_inliers(associations, chunk, inlier_radius).sum(1) for chunk in chunks])
+    seen = set()
+    for index in np.argsort(-counts, kind="stable"):
+        if counts[index] < 2:
+            return
+        inliers = get_inliers(associations, T[index : index + 1], inlier_radius)[0]
+        key = inliers.tobytes()
+        if key not in seen:
+            seen.add(key)
+            yield inliers
