@@ -1,0 +1,188 @@
+"""Submaps: gravity-aligned point clouds, one a place, checked and cleaned on the way in."""
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from terrainloop.errors import TerrainLoopError
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+MIN_POINTS = 100
+"""A 10 x 10 grid: fewer points cannot hold the handful of keypoints that one loop closure needs."""
+
+_FARTHEST = 1e10  # metres; beyond any frame on a planet, even in millimetres: an uninitialised value
+_COARSEST = 5e-3  # metres; coordinates stored in steps above this have lost the shape of the ground
+_ALL_ON_A_LINE = 1e-3  # width over length of a cloud that covers no area
+_LARGEST_SIDE = 2000.0  # metres; submaps are tens to hundreds of metres across ...
+_LARGEST_CELL = 25.0  # ... and hold far more than one point in so many square metres
+_FLAT = 0.2  # thickness over width of what surely is a surface
+_STEEPEST = np.radians(70.0)  # a surface steeper than this is no ground
+_TALLEST = 3.0  # height over width of what surely is no ground
+
+
+@dataclass(frozen=True, eq=False)
+class Submap:
+    """A point cloud in its own gravity-aligned frame (z up), fit to be mapped.
+
+    Parameters
+    ----------
+    points : array_like, (N, 3)
+        Metres. Rows with NaN or infinity and exact repeats are dropped; the rest keep their order and
+        their frame, however far from its origin they lie.
+    name, session : str
+        Without path separators, commas and control characters: they go into file names and CSVs.
+    stamp : float
+        Seconds, or the index within the mission.
+    intensity : array_like, (N,), optional
+        One value a point, kept in step with `points`.
+    repairs : tuple of str
+        What was repaired on the way in, in words; what construction repairs is added and logged.
+
+    Raises
+    ------
+    TerrainLoopError
+        Where no elevation map could come of the points: wrong shape, fewer than `MIN_POINTS`, no area,
+        millimetres, coordinates too large for their type, z not up.
+    """
+
+    points: Array
+    name: str = "submap"
+    session: str = ""
+    stamp: float = 0.0
+    intensity: Array | None = None
+    repairs: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_label("name", self.name)
+        if self.session:
+            _check_label("session", self.session)
+        given = _numbers(self.points)
+        points = np.array(given, dtype=np.float64)
+        intensity = None if self.intensity is None else _one_a_point(self.intensity, len(points))
+        rows, repairs = _usable_rows(points)
+        points = points[rows]
+        _check_count(points, repairs)
+        low, high = np.percentile(points, [1, 99], axis=0)
+        # Everything below looks at the bulk of the cloud: a few stray points must not decide.
+        bulk = points[((points >= low) & (points <= high)).all(axis=1)] - low
+        _check_units(high - low, len(points))
+        repairs += _check_precision(float(np.abs([low, high]).max()), given.dtype)
+        _check_area(bulk)
+        _check_gravity(bulk, high - low)
+        for repair in repairs:
+            logger.warning("%s: %s", self.name, repair)
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "intensity", None if intensity is None else intensity[rows])
+        object.__setattr__(self, "repairs", tuple(dict.fromkeys([*self.repairs, *repairs])))
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def _check_label(what: str, label: str) -> None:
+    if not label.strip() or any(c in "/\\," or not c.isprintable() for c in label):
+        raise TerrainLoopError(
+            expected=f"a {what} without path separators, commas and control characters",
+            found=repr(label),
+            mend="rename it",
+        )
+
+
+def _numbers(points: ArrayLike) -> NDArray[np.generic]:
+    """`points` as the numeric (N, 3) array it has to be, in the type it was given in."""
+    try:
+        array = np.asarray(points)
+    except ValueError:
+        array = np.empty(0, dtype=object)
+    if array.dtype.kind not in "fiu" or array.ndim != 2 or array.shape[1] != 3:
+        raise TerrainLoopError(
+            expected="numbers of shape (N, 3), the columns x, y and z in metres",
+            found=f"shape {array.shape} of {array.dtype}",
+            mend="give one row a point (transpose if x, y and z are the rows)",
+        )
+    return array
+
+
+def _one_a_point(values: ArrayLike, count: int) -> Array:
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu" or array.shape != (count,):
+        raise TerrainLoopError(
+            expected=f"one intensity a point, shape ({count},)",
+            found=f"shape {array.shape} of {array.dtype}",
+            mend="give as many numbers as points, or none",
+        )
+    return array.astype(np.float64)
+
+
+def _usable_rows(points: Array) -> tuple[NDArray[np.intp], list[str]]:
+    """Rows to keep, in order, and what was wrong with the others."""
+    finite = np.flatnonzero((np.abs(points) < _FARTHEST).all(axis=1))  # False for NaN too
+    order = finite[np.lexsort(points[finite].T)]
+    repeats = order[1:][(np.diff(points[order], axis=0) == 0).all(axis=1)]
+    counts = {"not finite": len(points) - len(finite), "an exact repeat of another": len(repeats)}
+    repairs = [f"dropped {n} of {len(points)} points: {what}" for what, n in counts.items() if n]
+    return np.setdiff1d(finite, repeats, assume_unique=True), repairs
+
+
+def _check_count(points: Array, repairs: list[str]) -> None:
+    if len(points) < MIN_POINTS:
+        raise TerrainLoopError(
+            expected=f"at least {MIN_POINTS} different points",
+            found="; ".join([str(len(points)), *repairs]),
+            mend="join several scans into one submap",
+        )
+
+
+def _check_units(extent: Array, count: int) -> None:
+    width, depth = extent[:2]
+    if max(width, depth) > _LARGEST_SIDE and width * depth > _LARGEST_CELL * count:
+        raise TerrainLoopError(
+            expected="a submap in metres, some 5 to 500 m across",
+            found=f"{count} points over {width:.0f} x {depth:.0f} m",
+            mend="divide by 1000 if these are millimetres, or cut it into submaps",
+        )
+
+
+def _check_precision(largest: float, dtype: np.dtype[np.generic]) -> list[str]:
+    """Refuse a type that has rounded the coordinates away; say so where only single precision would."""
+    steps_of = np.float64 if dtype.kind in "iu" else dtype.type
+    if np.spacing(steps_of(largest)) > _COARSEST:
+        raise TerrainLoopError(
+            expected=f"coordinates kept to {1000 * _COARSEST:.0f} mm",
+            found=f"{dtype} coordinates up to {largest:.0f} m, which round to "
+            f"{np.spacing(steps_of(largest)):.2g} m",
+            mend="export them as double, or subtract an offset before storing them",
+        )
+    if np.spacing(np.float32(largest)) > _COARSEST:
+        return [f"coordinates up to {largest:.0f} m: kept in their frame, mapped about a local origin"]
+    return []
+
+
+def _check_area(bulk: Array) -> None:
+    narrow, long = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(bulk[:, :2].T)), 0))
+    if narrow <= _ALL_ON_A_LINE * long:
+        raise TerrainLoopError(
+            expected="points that cover an area in x and y",
+            found=f"all within {narrow:.2g} m of a {'line' if long > 0 else 'point'} as seen from above",
+            mend="join scans over an area into one submap, and rotate it so that z is up",
+        )
+
+
+def _check_gravity(bulk: Array, extent: Array) -> None:
+    """Refuse what is surely not seen with z up: a wall-like sheet, or a tower."""
+    variances, axes = np.linalg.eigh(np.cov(bulk.T))
+    slope = np.arccos(min(abs(axes[2, 0]), 1.0))
+    wall = variances[0] < _FLAT**2 * variances[1] and slope > _STEEPEST
+    if wall or extent[2] > _TALLEST * extent[:2].max():
+        shape = f"a surface at {np.degrees(slope):.0f} degrees to the horizontal" if wall else "a tower"
+        width, depth, height = extent
+        raise TerrainLoopError(
+            expected="a gravity-aligned cloud, z up",
+            found=f"{shape}, {width:.3g} x {depth:.3g} m and {height:.3g} m in z",
+            mend="rotate it so that z is up (camera frames have z forward and y down)",
+        )
