@@ -1,0 +1,1 @@
+"""Simulated missions with ground truth: terrain, sensors, rover paths that revisit."""

@@ -1,0 +1,227 @@
+"""Missions of a simulated rover: submaps, odometry and truth, in memory or as a mission folder."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path as FilePath
+
+import numpy as np
+import yaml
+from numpy.random import Generator, SeedSequence
+from numpy.typing import NDArray
+
+from terrainloop.errors import TerrainLoopError
+from terrainloop.geometry import se3, transform
+from terrainloop.io.clouds import write_cloud
+from terrainloop.io.trajectories import Trajectory, write_tum
+from terrainloop.simulation.odometry import Drift, estimate, true_poses
+from terrainloop.simulation.paths import revisiting_path
+from terrainloop.simulation.sensors import SpinningLidar, StereoCamera
+from terrainloop.simulation.terrain import Terrain, make_terrain
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A sensor on the rover and how its frames become submaps; metres and degrees.
+
+    Attributes
+    ----------
+    sensor : StereoCamera or SpinningLidar
+        What looks at the ground.
+    mast : float
+        Height of the sensor above the ground between the wheels.
+    pitch_deg : float
+        How far the sensor looks down.
+    submap_length, frame_spacing : float
+        Distance driven in a submap and between two frames.
+    voxel : float
+        Side of the voxels that are thinned to the mean of their points.
+    terrain_resolution : float
+        Node distance of the height field.
+    """
+
+    sensor: StereoCamera | SpinningLidar
+    mast: float
+    pitch_deg: float
+    submap_length: float
+    frame_spacing: float
+    voxel: float
+    terrain_resolution: float
+
+    @property
+    def frames(self) -> int:
+        """Frames in a submap."""
+        return round(self.submap_length / self.frame_spacing)
+
+    @property
+    def T_body_sensor(self) -> Array:
+        """Pose of the sensor on the rover."""
+        return se3(0.0, 0.0, self.mast, 0.0, np.radians(self.pitch_deg), 0.0)
+
+
+SETUPS = {
+    "stereo": Setup(StereoCamera(), 1.1, 20.0, 7.0, 0.5, 0.035, 0.035),
+    "lidar": Setup(SpinningLidar(), 1.5, 0.0, 25.0, 1.0, 0.10, 0.05),
+}
+SENSORS = tuple(SETUPS)
+
+
+@dataclass(frozen=True)
+class SimulatedMission:
+    """Submaps of a drive with their estimated and true poses.
+
+    A submap frame has its origin on the ground under the rover at the submap's start, x along the
+    estimated heading and z against the estimated gravity.
+
+    Attributes
+    ----------
+    world, sensor : str
+        As asked for.
+    seed : int
+        As asked for.
+    clouds : list of array, (N, 3) float32
+        Points of each submap in its frame, in metres.
+    odometry : array, (M, 4, 4)
+        T_odometry_submap: poses as dead reckoning has them, gravity-aligned by construction.
+    truth : array, (M, 4, 4)
+        T_world_submap: where the frame really is, tilted by the error of the estimated gravity, so that
+        it takes the points onto the terrain up to noise and to the drift since the submap's start.
+    terrain : Terrain
+        The ground.
+    legs : tuple of str
+        For each submap "lap", "same", "across" or "opposite", as driven at its middle.
+    """
+
+    world: str
+    seed: int
+    sensor: str
+    clouds: list[NDArray[np.float32]]
+    odometry: Array
+    truth: Array
+    terrain: Terrain
+    legs: tuple[str, ...]
+
+
+def simulate_mission(
+    world: str = "etna",
+    seed: int = 0,
+    submaps: int = 16,
+    sensor: str = "stereo",
+    progress: Callable[[int, int], None] | None = None,
+) -> SimulatedMission:
+    """Drive a rover over a world along a path that revisits.
+
+    Terrain, path, odometry and sensor draw from independent streams of the one seed; the result does
+    not depend on the number of threads.
+
+    Parameters
+    ----------
+    world : str
+        "etna", "morocco", "mars" or "flat".
+    seed : int
+        Not negative.
+    submaps : int
+        How many; from about 12 on the path also comes back in the opposite direction.
+    sensor : str
+        "stereo" or "lidar".
+    progress : callable, optional
+        Told the number of submaps done and their total after each.
+
+    Returns
+    -------
+    SimulatedMission
+        Submaps in the order driven.
+
+    Raises
+    ------
+    TerrainLoopError
+        Unknown world or sensor, negative seed, or no submaps.
+    """
+    setup = _checked_setup(sensor, submaps, seed)
+    for_terrain, for_path, for_odometry, for_sensor = SeedSequence(seed).spawn(4)
+    length = submaps * setup.submap_length
+    path = revisiting_path(np.random.default_rng(for_path), length, setup.frame_spacing)
+    half_side = np.abs(path.xy).max() + setup.sensor.max_range + 2.0
+    terrain = make_terrain(world, for_terrain, 2 * float(half_side), setup.terrain_resolution)
+    true = true_poses(terrain, path)
+    frames = estimate(true, setup.frames, Drift(), np.random.default_rng(for_odometry))
+    clouds = []
+    with ThreadPoolExecutor() as pool:
+        for i, stream in enumerate(for_sensor.spawn(submaps)):
+            chosen = slice(i * setup.frames, (i + 1) * setup.frames)
+            clouds.append(_submap(setup, terrain, true[chosen], frames.local[chosen], stream, pool))
+            if progress:
+                progress(i + 1, submaps)
+    middles = range(setup.frames // 2, len(true), setup.frames)
+    legs = tuple(path.legs[i] for i in middles)
+    return SimulatedMission(world, seed, sensor, clouds, frames.odometry, frames.truth, terrain, legs)
+
+
+def _checked_setup(sensor: str, submaps: int, seed: int) -> Setup:
+    if sensor not in SETUPS:
+        raise TerrainLoopError(
+            expected="a sensor out of " + ", ".join(SENSORS), found=repr(sensor), mend="choose one of these"
+        )
+    if submaps < 1:
+        raise TerrainLoopError(
+            expected="at least one submap", found=str(submaps), mend="ask for 1 or more; 16 has loops"
+        )
+    if seed < 0:
+        raise TerrainLoopError(expected="a seed of 0 or more", found=str(seed), mend="drop the sign")
+    return SETUPS[sensor]
+
+
+def _submap(
+    setup: Setup, terrain: Terrain, true: Array, local: Array, stream: SeedSequence, pool: ThreadPoolExecutor
+) -> NDArray[np.float32]:
+    """Frames seen from the true poses, put together by the estimated ones, thinned."""
+
+    def frame(i: int, rng: Generator) -> Array:
+        seen = setup.sensor.observe(terrain, true[i] @ setup.T_body_sensor, rng)
+        return transform(local[i] @ setup.T_body_sensor, seen)
+
+    generators = [np.random.default_rng(child) for child in stream.spawn(len(true))]
+    points = np.concatenate(list(pool.map(frame, range(len(true)), generators)))
+    return thin(points, setup.voxel).astype(np.float32)
+
+
+def thin(points: Array, voxel: float) -> Array:
+    """Mean of the points (N, 3) in each cubic voxel."""
+    cells = np.floor((points - points.min(axis=0)) / voxel).astype(np.int64)
+    _, member, counts = np.unique(
+        np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)),
+        return_inverse=True,
+        return_counts=True,
+    )
+    sums = [np.bincount(member, weights=points[:, i]) for i in range(3)]
+    return np.asarray(np.stack(sums, axis=-1) / counts[:, None])
+
+
+def write_mission(mission: SimulatedMission, path: FilePath | str) -> None:
+    """Write a mission folder: ``clouds/*.ply``, ``odometry.tum``, ``truth.tum``, ``simulation.yaml``.
+
+    The first column of the trajectories is the index of the submap.
+    """
+    folder = FilePath(path)
+    (folder / "clouds").mkdir(parents=True, exist_ok=True)
+    for i, cloud in enumerate(mission.clouds):
+        write_cloud(folder / "clouds" / f"{i:06d}.ply", cloud)
+    stamps = np.arange(len(mission.clouds), dtype=float)
+    write_tum(folder / "odometry.tum", Trajectory(stamps, mission.odometry))
+    write_tum(folder / "truth.tum", Trajectory(stamps, mission.truth))
+    (folder / "simulation.yaml").write_text(yaml.safe_dump(_description(mission), sort_keys=False))
+
+
+def _description(mission: SimulatedMission) -> dict[str, object]:
+    setup = asdict(SETUPS[mission.sensor])
+    return {
+        "world": mission.world,
+        "seed": mission.seed,
+        "submaps": len(mission.clouds),
+        "sensor": mission.sensor,
+        "setup": setup,
+        "drift": asdict(Drift()),
+        "legs": list(mission.legs),
+    }

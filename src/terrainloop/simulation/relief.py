@@ -1,0 +1,164 @@
+"""Building blocks of a height field: power-law noise, wind ripples, craters, channels, rocks.
+
+Every function returns heights in metres on a square grid (rows = y, columns = x).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+from scipy import fft
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A square grid of ``size`` x ``size`` nodes, ``resolution`` metres apart."""
+
+    size: int
+    resolution: float
+
+    @property
+    def extent(self) -> float:
+        """Length of a side, in metres."""
+        return (self.size - 1) * self.resolution
+
+
+def power_law(rng: Generator, grid: Grid, *, rms: float, outer_scale: float, exponent: float) -> Array:
+    """Isotropic Gaussian noise with power spectral density (k^2 + 1/outer_scale^2)^(-exponent/2).
+
+    Below the outer scale (metres) the surface is self-affine with Hurst exponent (exponent - 2) / 2;
+    above it the spectrum is level, so that the amplitude stays finite. ``rms`` is in metres.
+    """
+    k_squared = sum(k**2 for k in _wave_numbers(grid))
+    amplitude = (k_squared + outer_scale**-2) ** (-exponent / 4)
+    field = _filtered_noise(rng, grid, amplitude).real
+    return np.asarray(rms * (field - field.mean()) / field.std())
+
+
+def ripples(rng: Generator, grid: Grid, *, height: float, wavelength: float) -> Array:
+    """Wind ripples: crest to trough about ``height``, crests about ``wavelength`` apart.
+
+    Noise within a narrow band of wave vectors has a phase that runs from crest to crest and, where its
+    amplitude vanishes, ends or forks a crest: the defects of real ripple fields.
+    """
+    kx, ky = _wave_numbers(grid)
+    wind = rng.uniform(0, np.pi)
+    along, across = kx * np.cos(wind) + ky * np.sin(wind), ky * np.cos(wind) - kx * np.sin(wind)
+    distance = ((along * wavelength - 1) / 0.16) ** 2 + (across * wavelength / 0.28) ** 2
+    wave = _filtered_noise(rng, grid, np.exp(-distance / 2))
+    phase, strength = np.angle(wave), np.abs(wave) / np.abs(wave).mean()
+    profile = np.cos(phase) + 0.25 * np.cos(2 * phase + 0.8)  # sharp crests, a steeper lee side
+    return np.asarray(0.5 * height * np.tanh(strength) * profile)
+
+
+def channels(rng: Generator, grid: Grid, *, depth: float, width: float) -> Array:
+    """Shallow meandering channels: they follow the zero contours of smooth noise."""
+    level = power_law(rng, grid, rms=1.0, outer_scale=12.0, exponent=6.0)
+    slope = np.hypot(*np.gradient(level, grid.resolution))
+    return np.asarray(-depth * np.exp(-0.5 * (level / (slope + 0.02) / (0.5 * width)) ** 2))
+
+
+def craters(rng: Generator, grid: Grid, *, per_area: float, diameters: tuple[float, float]) -> Array:
+    """Degraded impact craters, depth about a tenth of the diameter, numbers falling as 1 / D^2.
+
+    Bowl 4 d ((r/R)^2 - 1), with a raised rim that decays over a third of the radius.
+    """
+    heights = np.zeros((grid.size, grid.size))
+    x = np.arange(grid.size) * grid.resolution
+    smallest, largest = diameters
+    for _ in range(rng.poisson(per_area * grid.extent**2)):
+        share = rng.uniform()
+        radius = 0.5 / np.sqrt((1 - share) / smallest**2 + share / largest**2)
+        depth = 2 * radius * rng.uniform(0.06, 0.12)
+        centre = rng.uniform(0, grid.extent, 2)
+        rho = np.hypot(x - centre[0], (x - centre[1])[:, None]) / radius
+        bowl = depth * (np.minimum(rho, 1) ** 2 - 1)
+        rim = 0.3 * depth * np.exp(-(((rho - 1) / 0.3) ** 2))
+        heights += bowl + rim
+    return heights
+
+
+def rock_diameters(rng: Generator, abundance: float, area: float, limits: tuple[float, float]) -> Array:
+    """Diameters of the rocks on an area, by the exponential law of Golombek & Rapp (1997).
+
+    The fraction of ground covered by rocks of diameter D or more is k exp(-q(k) D) with
+    q(k) = 1.79 + 0.152 / k (Golombek & Rapp, Size-frequency distributions of rocks on Mars and Earth
+    analog sites, J. Geophys. Res. 102 E2, 1997). The density of rocks per metre of diameter follows by
+    dividing the covered area by that of one rock: 4 k q exp(-q D) / (pi D^2).
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of the sample.
+    abundance : float
+        k, the fraction of ground that rocks of any size cover.
+    area : float
+        Ground to furnish, in square metres.
+    limits : (float, float)
+        Smallest and largest diameter, in metres.
+
+    Returns
+    -------
+    array, (N,)
+        Diameters in metres.
+    """
+    diameter = np.geomspace(*limits, 2000)
+    q = 1.79 + 0.152 / abundance
+    density = 4 * abundance * q * np.exp(-q * diameter) / (np.pi * diameter**2)
+    steps = 0.5 * (density[1:] + density[:-1]) * np.diff(diameter)
+    cumulative = np.concatenate([[0.0], np.cumsum(steps)])
+    count = rng.poisson(area * cumulative[-1])
+    return np.asarray(np.interp(rng.uniform(0, cumulative[-1], count), cumulative, diameter))
+
+
+def rocks(rng: Generator, grid: Grid, *, abundance: float, limits: tuple[float, float]) -> Array:
+    """Height of the rocks above the ground, their diameters drawn by `rock_diameters`."""
+    heights = np.zeros((grid.size, grid.size))
+    diameters = rock_diameters(rng, abundance, grid.extent**2, limits)
+    reach = np.ceil(0.65 * diameters / grid.resolution).astype(int)  # outlines bulge by at most 30 %
+    for half_width in np.unique(reach):
+        _add_rocks(rng, heights, diameters[reach == half_width] / grid.resolution, half_width)
+    return heights * grid.resolution
+
+
+def _add_rocks(rng: Generator, heights: Array, diameters: Array, half_width: int) -> None:
+    """Raise ``heights`` to half-buried, turned, lopsided ellipsoids; all lengths in pixels."""
+    n = len(diameters)
+    centre = rng.uniform(0, len(heights) - 1, (2, n, 1, 1))
+    turn, skew_2, skew_3 = rng.uniform(0, 2 * np.pi, (3, n, 1, 1))
+    slimness, flatness = rng.uniform(0.6, 1.0, (n, 1, 1)), rng.uniform(0.5, 1.1, (n, 1, 1))
+    bluntness, tilt = rng.uniform(2.0, 4.0, (n, 1, 1)), rng.uniform(0.0, 0.35, (n, 1, 1))
+    radius = 0.5 * diameters[:, None, None]
+    span = np.arange(-half_width, half_width + 1)
+    column, row = np.rint(centre[0]) + span, np.rint(centre[1]) + span[:, None]
+    dx, dy = column - centre[0], row - centre[1]
+    along = (dx * np.cos(turn) + dy * np.sin(turn)) / radius
+    across = (dy * np.cos(turn) - dx * np.sin(turn)) / (radius * slimness)
+    angle = np.arctan2(across, along)
+    outline = 1 + 0.12 * np.cos(2 * angle + skew_2) + 0.1 * np.cos(3 * angle + skew_3)
+    rho = np.minimum(np.hypot(along, across) / outline, 1)
+    bump = radius * slimness * flatness * np.sqrt(1 - rho**bluntness) * (1 + tilt * along)
+    row, column = np.broadcast_arrays(row.astype(int), column.astype(int))
+    inside = (bump > 0) & (row >= 0) & (row < len(heights)) & (column >= 0) & (column < len(heights))
+    np.maximum.at(heights, (row[inside], column[inside]), bump[inside])
+
+
+def _padded(grid: Grid) -> int:
+    # An FFT field is periodic; cropping a larger one keeps opposite borders from agreeing.
+    return fft.next_fast_len(int(1.25 * grid.size) + 1)
+
+
+def _wave_numbers(grid: Grid) -> tuple[Array, Array]:
+    """Cycles per metre along x and y of the padded grid, in FFT order."""
+    k = fft.fftfreq(_padded(grid), grid.resolution)
+    return k, k[:, None]
+
+
+def _filtered_noise(rng: Generator, grid: Grid, amplitude: Array) -> NDArray[np.complex128]:
+    """White complex noise through a filter given over the padded wave numbers, cropped to the grid."""
+    shape = amplitude.shape
+    spectrum = amplitude * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
+    return fft.ifft2(spectrum)[: grid.size, : grid.size]

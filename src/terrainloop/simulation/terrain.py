@@ -1,0 +1,148 @@
+"""Bare terrain as a height field, in four worlds."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.random import Generator, SeedSequence
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from terrainloop.errors import TerrainLoopError
+from terrainloop.simulation.relief import Grid, channels, craters, power_law, ripples, rocks
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """A height field.
+
+    Attributes
+    ----------
+    height : array, (rows, columns), float32
+        Height in metres; rows run along y, columns along x.
+    resolution : float
+        Distance between neighbouring nodes, in metres.
+    origin : (float, float)
+        World x and y of node (0, 0), in metres.
+    """
+
+    height: NDArray[np.float32]
+    resolution: float
+    origin: tuple[float, float]
+
+    def height_at(self, xy: ArrayLike) -> Array:
+        """Bilinear height in metres at world points (..., 2); outside, that of the nearest border."""
+        xy = np.asarray(xy, dtype=float)
+        rows, columns = self.height.shape
+        x = np.clip((xy[..., 0] - self.origin[0]) / self.resolution, 0, columns - 1)
+        y = np.clip((xy[..., 1] - self.origin[1]) / self.resolution, 0, rows - 1)
+        column = np.minimum(x.astype(np.int64), columns - 2)
+        row = np.minimum(y.astype(np.int64), rows - 2)
+        x, y, corner, nodes = x - column, y - row, row * columns + column, self.height.ravel()
+        lower = nodes[corner] * (1 - x) + nodes[corner + 1] * x
+        upper = nodes[corner + columns] * (1 - x) + nodes[corner + columns + 1] * x
+        return np.asarray(lower * (1 - y) + upper * y)
+
+    def slope_at(self, xy: ArrayLike) -> Array:
+        """Gradient (..., 2) of the height at world points (..., 2), by central differences."""
+        xy, step = np.asarray(xy, dtype=float), np.array([self.resolution, 0.0])
+        along_x = self.height_at(xy + step) - self.height_at(xy - step)
+        along_y = self.height_at(xy + step[::-1]) - self.height_at(xy - step[::-1])
+        return np.stack([along_x, along_y], axis=-1) / (2 * self.resolution)
+
+    def contains(self, xy: ArrayLike) -> NDArray[np.bool_]:
+        """Whether world points (..., 2) lie within the height field."""
+        pixels = (np.asarray(xy, dtype=float) - self.origin) / self.resolution
+        upper = np.array(self.height.shape[::-1]) - 1
+        return np.asarray(((pixels >= 0) & (pixels <= upper)).all(axis=-1))
+
+    @cached_property
+    def ceiling(self) -> NDArray[np.float32]:
+        """Greatest height within `CEILING_PIXELS` of each node: where a ray above it may stride."""
+        return np.asarray(ndimage.maximum_filter(self.height, 2 * CEILING_PIXELS + 1, mode="nearest"))
+
+
+CEILING_PIXELS = 10
+
+
+def _etna(rng: Generator, grid: Grid) -> Array:
+    """Cinder slopes: 4-8 deg, metre-scale undulation, fine roughness, few rocks."""
+    azimuth, steepness = rng.uniform(0, 2 * np.pi), np.tan(np.radians(rng.uniform(4, 8)))
+    x = np.arange(grid.size) * grid.resolution
+    slope: Array = steepness * (np.cos(azimuth) * x + np.sin(azimuth) * x[:, None])
+    undulation = power_law(rng, grid, rms=0.16, outer_scale=9.0, exponent=4.2)
+    cinder = power_law(rng, grid, rms=0.009, outer_scale=0.5, exponent=3.0)
+    return slope + undulation + cinder + rocks(rng, grid, abundance=0.012, limits=(0.08, 0.8))
+
+
+def _morocco(rng: Generator, grid: Grid) -> Array:
+    """A pebble plain: hardly any relief, many small stones, shallow channels."""
+    undulation = power_law(rng, grid, rms=0.04, outer_scale=8.0, exponent=4.0)
+    gravel = power_law(rng, grid, rms=0.006, outer_scale=0.3, exponent=2.6)
+    channel = channels(rng, grid, depth=0.12, width=1.0)
+    return undulation + gravel + channel + rocks(rng, grid, abundance=0.04, limits=(0.06, 0.4))
+
+
+def _mars(rng: Generator, grid: Grid) -> Array:
+    """Wind ripples with defects, rocks, a few craters."""
+    undulation = power_law(rng, grid, rms=0.10, outer_scale=12.0, exponent=4.2)
+    sand = power_law(rng, grid, rms=0.004, outer_scale=0.3, exponent=3.0)
+    cover = 0.5 + 0.5 * np.tanh(power_law(rng, grid, rms=1.0, outer_scale=8.0, exponent=5.0) + 0.6)
+    waves = cover * ripples(rng, grid, height=0.12, wavelength=1.5)
+    holes = craters(rng, grid, per_area=0.003, diameters=(1.5, 8.0))
+    return undulation + sand + waves + holes + rocks(rng, grid, abundance=0.02, limits=(0.08, 0.8))
+
+
+def _flat(rng: Generator, grid: Grid) -> Array:
+    """A playa: millimetres of roughness, less than any of the sensors resolves."""
+    return power_law(rng, grid, rms=0.002, outer_scale=0.5, exponent=2.6)
+
+
+_WORLDS: dict[str, Callable[[Generator, Grid], Array]] = {
+    "etna": _etna,
+    "morocco": _morocco,
+    "mars": _mars,
+    "flat": _flat,
+}
+WORLDS = tuple(_WORLDS)
+
+
+def make_terrain(world: str, seed: int | SeedSequence, size_m: float, resolution: float) -> Terrain:
+    """A square terrain about the world origin.
+
+    Parameters
+    ----------
+    world : str
+        One of `WORLDS`.
+    seed : int or numpy.random.SeedSequence
+        The same seed, world, size and resolution make the same terrain.
+    size_m, resolution : float
+        Side and node distance, in metres.
+
+    Returns
+    -------
+    Terrain
+        Not periodic within its extent.
+
+    Raises
+    ------
+    TerrainLoopError
+        Unknown world, or a size or resolution that is not positive.
+    """
+    if world not in _WORLDS:
+        raise TerrainLoopError(
+            expected="a world out of " + ", ".join(WORLDS), found=repr(world), mend="choose one of these"
+        )
+    if not (0 < resolution < size_m < np.inf):
+        raise TerrainLoopError(
+            expected="0 < resolution < size, in metres",
+            found=f"resolution {resolution}, size {size_m}",
+            mend="give a size of tens of metres and a resolution of centimetres",
+        )
+    grid = Grid(size=int(np.ceil(size_m / resolution)) + 1, resolution=resolution)
+    height = _WORLDS[world](np.random.default_rng(seed), grid)
+    corner = -0.5 * grid.extent
+    return Terrain((height - height.mean()).astype(np.float32), resolution, (corner, corner))
