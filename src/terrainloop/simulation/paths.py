@@ -1,5 +1,6 @@
-"""Rover paths that revisit: a lap, the same way again, across, back in the opposite direction."""
+"""Rover paths that revisit: back in the opposite direction, across, and the same way again."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ class Path:
     heading : array, (N,)
         Direction of travel in radians, counter-clockwise from x.
     legs : tuple of str, (N,)
-        "lap", "same", "across" or "opposite": how each position relates to the first lap.
+        "first", "turn", "opposite" or "same": how each position relates to the first leg.
     """
 
     xy: Array
@@ -36,11 +37,12 @@ class Path:
 def revisiting_path(rng: Generator, length: float, spacing: float) -> Path:
     """A drivable path of ``length`` metres with a position every ``spacing`` metres.
 
-    The rover drives once around a smooth closed curve and some way on (same direction, 0.3-1.5 m
-    beside its track), cuts across to the far side, crosses the first lap there, follows it backwards
-    (opposite direction), cuts across again, and so on. The lap takes 0.45 of the length.
+    The rover drives along a smooth curve, turns round and drives back over a part of it, turns again
+    and repeats a part in the first direction, and so on, each time 0.3-1.5 m beside the curve. A turn
+    swings out to one side and comes back across the curve at a right angle. The first leg takes 0.42
+    of the length: an arc, which on long drives closes to a lap.
     """
-    curve = _ClosedCurve.draw(rng, max(0.45 * length, 36.0))
+    curve = _Curve.draw(rng, max(0.42 * length / (2 * np.pi), 18.0))
     corners, legs = _route(rng, curve, length)
     driven = _travelled(corners)
     even = np.arange(0.0, driven[-1], SAMPLING)
@@ -55,16 +57,16 @@ def revisiting_path(rng: Generator, length: float, spacing: float) -> Path:
 
 
 @dataclass(frozen=True)
-class _ClosedCurve:
-    """r(angle) = radius (1 + 0.12 cos(2 angle + a) + 0.08 cos(3 angle + b))."""
+class _Curve:
+    """r(angle) = radius (1 + 0.10 cos(2 angle + a) + 0.06 cos(3 angle + b))."""
 
     radius: float
     phases: tuple[float, float]
 
     @classmethod
-    def draw(cls, rng: Generator, circumference: float) -> "_ClosedCurve":
+    def draw(cls, rng: Generator, radius: float) -> "_Curve":
         first, second = rng.uniform(0, 2 * np.pi, 2)
-        return cls(circumference / (2 * np.pi), (float(first), float(second)))
+        return cls(radius, (float(first), float(second)))
 
     def at(self, angle: Array, outwards: Array | float = 0.0) -> Array:
         """Points (N, 2) at polar angles (N,), shifted outwards by some metres."""
@@ -73,37 +75,35 @@ class _ClosedCurve:
         return np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1)
 
 
-def _route(rng: Generator, curve: _ClosedCurve, length: float) -> tuple[Array, list[str]]:
+def _route(rng: Generator, curve: _Curve, length: float) -> tuple[Array, list[str]]:
     """Corners (N, 2) of a polyline and the leg of each, a little longer than ``length``."""
     angle, turn = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0])
-    forwards = turn
-    end = angle + 2 * np.pi * turn
-    pieces, legs = [_follow(curve, angle, end, (0.0, 0.0))], ["lap"]
+    end = angle + turn * max(0.42 * length, 36.0) / curve.radius
+    pieces, legs = [_follow(curve, angle, end, (0.0, 0.0))], ["first"]
+    repeats = itertools.cycle([("opposite", 0.17), ("same", 0.11)])
     while sum(_travelled(piece)[-1] for piece in pieces) < 1.1 * length + 20.0:
-        angle, end = end, end + turn * max(0.12 * length, 12.0) / curve.radius
+        leg, share = next(repeats)
+        pieces.append(_turn_round(curve, end, turn, rng.choice([-1.0, 1.0])))
+        turn = -turn
+        angle = end + turn * 2.0 / curve.radius  # room to change over to the new offset
+        end = angle + turn * max(share * length, 8.0) / curve.radius
         offsets = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, 1.5, 2)
         pieces.append(_follow(curve, angle, end, (offsets[0], offsets[1])))
-        legs.append("same" if turn == forwards else "opposite")
-        crossing, turn = _cross(curve, end, turn), -turn
-        end += np.pi + turn * 9.0 / curve.radius
-        pieces.append(crossing)
-        legs.append("across")
+        legs += ["turn", leg]
     labels = [leg for leg, piece in zip(legs, pieces, strict=True) for _ in piece]
     return np.concatenate(pieces), labels
 
 
-def _follow(curve: _ClosedCurve, start: float, end: float, offsets: tuple[float, float]) -> Array:
+def _follow(curve: _Curve, start: float, end: float, offsets: tuple[float, float]) -> Array:
     """Along the curve between two angles, shifted outwards by one offset that runs into the other."""
     steps = int(np.ceil(abs(end - start) * curve.radius / SAMPLING)) + 1
     return curve.at(np.linspace(start, end, steps), np.linspace(*offsets, steps))
 
 
-def _cross(curve: _ClosedCurve, angle: float, turn: float) -> Array:
-    """From the curve through the middle, over its far side and around to join it the other way."""
-    inner = curve.at(np.array([angle]), -2.0)
-    along = -turn / curve.radius * np.array([0.0, 4.0, 9.0])
-    outer = curve.at(angle + np.pi + along, np.array([4.0, 4.0, 0.0]))
-    return np.concatenate([inner, outer])
+def _turn_round(curve: _Curve, angle: float, turn: float, side: float) -> Array:
+    """Ahead to one side, straight across the curve, and back to it on the other side."""
+    ahead = np.array([3.0, 7.0, 7.0, 3.0])
+    return curve.at(angle + turn * ahead / curve.radius, side * np.array([3.0, 3.5, -3.5, -3.0]))
 
 
 def _travelled(points: Array) -> Array:

@@ -75,12 +75,17 @@ def _bisect(terrain: Terrain, origin: Array, directions: Array, far: Array, step
     return 0.5 * (near + far)
 
 
-def _returned(terrain: Terrain, points: Array, directions: Array, rng: Generator) -> NDArray[np.bool_]:
-    """Which hits (N, 3) of rays (N, 3) yield a measurement: ever fewer below 6 deg of incidence."""
-    slope = terrain.slope_at(points[:, :2])
+def _returns(terrain: Terrain, T_world_sensor: Array, rays: Array, max_range: float, rng: Generator) -> Array:
+    """Distance (N,) along unit rays (N, 3) of the sensor frame; NaN where nothing comes back.
+
+    Below 6 deg of incidence ever fewer of the hits come back.
+    """
+    origin, directions = T_world_sensor[:3, 3], rays @ T_world_sensor[:3, :3].T
+    distances = cast_rays(terrain, origin, directions, max_range)
+    slope = terrain.slope_at(origin[:2] + np.nan_to_num(distances)[:, None] * directions[:, :2])
     along_normal = directions[:, 2] - (slope * directions[:, :2]).sum(-1)
     incidence = -along_normal / np.sqrt(1 + (slope**2).sum(-1))
-    return np.asarray(rng.uniform(0, 0.1, len(points)) < incidence)
+    return np.where(rng.uniform(0, 0.1, len(rays)) < incidence, distances, np.nan)
 
 
 @dataclass(frozen=True)
@@ -144,15 +149,11 @@ class StereoCamera:
 
     def _true_depth(self, terrain: Terrain, T_world_sensor: Array, pixels: Array, rng: Generator) -> Array:
         """Depth image (rows, columns) in metres; NaN where nothing or only grazed ground is seen."""
-        lengths = np.linalg.norm(pixels, axis=-1).ravel()
-        directions = (pixels.reshape(-1, 3) / lengths[:, None]) @ T_world_sensor[:3, :3].T
-        origin = T_world_sensor[:3, 3]
+        lengths = np.linalg.norm(pixels, axis=-1)
+        rays = (pixels / lengths[..., None]).reshape(-1, 3)
         # Noise may bring ground from beyond the range within it.
-        distances = cast_rays(terrain, origin, directions, 1.15 * self.max_range)
-        hit = np.flatnonzero(~np.isnan(distances))
-        points = origin + distances[hit, None] * directions[hit]
-        distances[hit[~_returned(terrain, points, directions[hit], rng)]] = np.nan
-        return np.asarray((distances / lengths).reshape(pixels.shape[:2]))
+        distances = _returns(terrain, T_world_sensor, rays, 1.15 * self.max_range, rng)
+        return np.asarray(distances.reshape(lengths.shape) / lengths)
 
     def _disparity_error(self, disparity: Array, rng: Generator) -> Array:
         """Error (rows, columns) in pixels: smooth over the image, white, and pixel locking."""
@@ -179,9 +180,8 @@ def _flying_pixels(disparity: Array, rng: Generator) -> Array:
     for axis in (0, 1):
         beside = np.roll(disparity, 1, axis)
         flying = (np.abs(beside - disparity) > 1) & (rng.random(disparity.shape) < 0.15)
-        disparity = np.where(
-            flying, disparity + rng.random(disparity.shape) * (beside - disparity), disparity
-        )
+        mixed = disparity + rng.random(disparity.shape) * (beside - disparity)
+        disparity = np.where(flying, mixed, disparity)
     return disparity
 
 
@@ -211,16 +211,13 @@ class SpinningLidar:
 
     def observe(self, terrain: Terrain, T_world_sensor: Array, rng: Generator) -> Array:
         """Points (N, 3) of one turn, in the sensor frame."""
-        shots = self._directions(rng.uniform(0, np.radians(self.azimuth_step_deg)))
-        directions, origin = shots @ T_world_sensor[:3, :3].T, T_world_sensor[:3, 3]
-        distances = cast_rays(terrain, origin, directions, self.max_range)
-        hit = np.flatnonzero(~np.isnan(distances))
-        points = origin + distances[hit, None] * directions[hit]
-        hit = hit[_returned(terrain, points, directions[hit], rng)]
-        measured = distances[hit] + self.range_noise * rng.standard_normal(len(hit))
-        return np.asarray(measured[:, None] * shots[hit])
+        rays = self._rays(rng.uniform(0, np.radians(self.azimuth_step_deg)))
+        distances = _returns(terrain, T_world_sensor, rays, self.max_range, rng)
+        back = ~np.isnan(distances)
+        measured = distances[back] + self.range_noise * rng.standard_normal(back.sum())
+        return np.asarray(measured[:, None] * rays[back])
 
-    def _directions(self, first_azimuth: float) -> Array:
+    def _rays(self, first_azimuth: float) -> Array:
         """Unit vectors (N, 3) of one turn, in the sensor frame."""
         elevation = np.radians(np.linspace(*self.elevations_deg, self.rings))[:, None]
         azimuth = first_azimuth + np.radians(np.arange(0, 360, self.azimuth_step_deg))
