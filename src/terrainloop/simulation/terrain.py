@@ -73,25 +73,25 @@ def _etna(rng: Generator, grid: Grid) -> Array:
     azimuth, steepness = rng.uniform(0, 2 * np.pi), np.tan(np.radians(rng.uniform(4, 8)))
     x = np.arange(grid.size) * grid.resolution
     slope: Array = steepness * (np.cos(azimuth) * x + np.sin(azimuth) * x[:, None])
-    undulation = power_law(rng, grid, rms=0.16, outer_scale=9.0, exponent=4.2)
-    cinder = power_law(rng, grid, rms=0.009, outer_scale=0.5, exponent=3.0)
+    undulation = power_law(rng, grid, rms=0.09, outer_scale=9.0, exponent=4.2)
+    cinder = power_law(rng, grid, rms=0.006, outer_scale=0.5, exponent=3.0)
     return slope + undulation + cinder + rocks(rng, grid, abundance=0.012, limits=(0.08, 0.8))
 
 
 def _morocco(rng: Generator, grid: Grid) -> Array:
     """A pebble plain: hardly any relief, many small stones, shallow channels."""
-    undulation = power_law(rng, grid, rms=0.04, outer_scale=8.0, exponent=4.0)
-    gravel = power_law(rng, grid, rms=0.006, outer_scale=0.3, exponent=2.6)
-    channel = channels(rng, grid, depth=0.12, width=1.0)
-    return undulation + gravel + channel + rocks(rng, grid, abundance=0.04, limits=(0.06, 0.4))
+    undulation = power_law(rng, grid, rms=0.025, outer_scale=8.0, exponent=4.2)
+    gravel = power_law(rng, grid, rms=0.004, outer_scale=0.3, exponent=2.6)
+    channel = channels(rng, grid, depth=0.06, width=1.2)
+    return undulation + gravel + channel + rocks(rng, grid, abundance=0.03, limits=(0.06, 0.4))
 
 
 def _mars(rng: Generator, grid: Grid) -> Array:
     """Wind ripples with defects, rocks, a few craters."""
-    undulation = power_law(rng, grid, rms=0.10, outer_scale=12.0, exponent=4.2)
+    undulation = power_law(rng, grid, rms=0.07, outer_scale=12.0, exponent=4.2)
     sand = power_law(rng, grid, rms=0.004, outer_scale=0.3, exponent=3.0)
     cover = 0.5 + 0.5 * np.tanh(power_law(rng, grid, rms=1.0, outer_scale=8.0, exponent=5.0) + 0.6)
-    waves = cover * ripples(rng, grid, height=0.12, wavelength=1.5)
+    waves = cover * ripples(rng, grid, height=0.08, wavelength=1.5)
     holes = craters(rng, grid, per_area=0.003, diameters=(1.5, 8.0))
     return undulation + sand + waves + holes + rocks(rng, grid, abundance=0.02, limits=(0.08, 0.8))
 
