@@ -64,7 +64,7 @@ def channels(rng: Generator, grid: Grid, *, depth: float, width: float) -> Array
 def craters(rng: Generator, grid: Grid, *, per_area: float, diameters: tuple[float, float]) -> Array:
     """Degraded impact craters, depth about a tenth of the diameter, numbers falling as 1 / D^2.
 
-    Bowl 4 d ((r/R)^2 - 1), with a raised rim that decays over a third of the radius.
+    Within the rim d ((r/R)^2 - 1); the raised rim decays over a third of the radius.
     """
     heights = np.zeros((grid.size, grid.size))
     x = np.arange(grid.size) * grid.resolution
@@ -73,11 +73,12 @@ def craters(rng: Generator, grid: Grid, *, per_area: float, diameters: tuple[flo
         share = rng.uniform()
         radius = 0.5 / np.sqrt((1 - share) / smallest**2 + share / largest**2)
         depth = 2 * radius * rng.uniform(0.06, 0.12)
-        centre = rng.uniform(0, grid.extent, 2)
-        rho = np.hypot(x - centre[0], (x - centre[1])[:, None]) / radius
+        column, row = rng.uniform(0, grid.extent, 2)
+        across, along = (slice(*np.searchsorted(x, [c - 2 * radius, c + 2 * radius])) for c in (column, row))
+        rho = np.hypot(x[across] - column, (x[along] - row)[:, None]) / radius
         bowl = depth * (np.minimum(rho, 1) ** 2 - 1)
         rim = 0.3 * depth * np.exp(-(((rho - 1) / 0.3) ** 2))
-        heights += bowl + rim
+        heights[along, across] += bowl + rim
     return heights
 
 
