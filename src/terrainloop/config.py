@@ -18,7 +18,7 @@ class _Frozen(BaseModel):
 class MapSettings(_Frozen):
     """How a submap becomes a gradient map."""
 
-    max_points: int = Field(2500, ge=50, description="points kept per submap, drawn at random")
+    max_points: int = Field(5000, ge=50, description="points kept per submap, drawn at random")
     length_scale: float | None = Field(
         None, gt=0, description="starting length scale of the kernel, m; null: twice the point spacing"
     )
@@ -81,7 +81,6 @@ class Settings(_Frozen):
         if name == "paper":
             return cls(
                 map=MapSettings(
-                    max_points=5000,
                     length_scale=0.316,
                     noise=0.02,
                     fit="submap",

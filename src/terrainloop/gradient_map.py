@@ -9,9 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.exact import predict_grid
-from terrainloop.gp.hyperparameters import maximise_likelihood
+from terrainloop.gp.hyperparameters import BLOCK_POINTS, maximise_likelihood
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.gp.surface import surface_of
+from terrainloop.submap import Submap
 
 Image = NDArray[np.float32]
 
@@ -64,13 +65,13 @@ class GradientMap:
     @classmethod
     def from_points(
         cls,
-        points: ArrayLike,
+        points: ArrayLike | Submap,
         length_scale: float | None = None,
         variance: float | None = None,
         noise: float | None = None,
         resolution: float | None = None,
         *,
-        max_points: int = 2500,
+        max_points: int = 5000,
         remove_plane: bool = True,
         max_variance_ratio: float = 0.25,
         seed: int = 0,
@@ -108,7 +109,8 @@ class GradientMap:
         fixed = [name for name, value in given.items() if value is not None]
         parameters = surface.start(**given)
         if len(fixed) < len(given):
-            parameters = maximise_likelihood([surface], parameters, fixed=fixed, workers=workers)
+            blocks = surface.blocks(BLOCK_POINTS)
+            parameters = maximise_likelihood(blocks, parameters, fixed=fixed, workers=workers)
         resolution = resolution or parameters.length_scale / PIXELS_PER_LENGTH_SCALE
         x, y = _axes(surface.xy, resolution)
         field = predict_grid(surface.xy, surface.elevation, parameters, x, y, workers=workers)

@@ -8,7 +8,7 @@ from functools import partial
 from terrainloop.config import Settings
 from terrainloop.errors import TerrainLoopError
 from terrainloop.features import Features
-from terrainloop.gp.hyperparameters import fit_hyperparameters
+from terrainloop.gp.hyperparameters import BLOCK_POINTS, fit_hyperparameters
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
@@ -119,6 +119,7 @@ def fit_database(submaps: Sequence[Submap], settings: Settings, *, workers: int 
         length_scale=settings.map.length_scale,
         noise=settings.map.noise,
         max_points=settings.map.max_points,
+        block_points=BLOCK_POINTS if settings.map.fit == "database" else None,
         remove_plane=settings.map.remove_plane,
         seed=settings.seed,
         workers=workers,

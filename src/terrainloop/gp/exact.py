@@ -141,7 +141,7 @@ def _variances(
 
 def _quadratic(precision: Array, ky: Array, kx: Array) -> Array:
     """k' A k at every pixel of a tile whose separable kernel factors are given; (rows, columns)."""
-    k = (ky[:, None, :] * kx[None, :, :]).reshape(-1, len(precision))
+    k = (ky[:, None, :] * kx[None, :, :]).reshape(len(ky) * len(kx), len(precision))
     return np.einsum("ij,ij->i", k @ precision, k).reshape(len(ky), len(kx))
 
 

@@ -1,6 +1,6 @@
 """What the Gaussian process sees of a cloud: a few thousand points about a local origin."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,8 +46,18 @@ class Surface:
             noise=0.2 * relief if noise is None else noise,
         )
 
+    def blocks(self, max_points: int) -> list["Surface"]:
+        """The surface cut at medians, across its longer side, into parts of at most `max_points`."""
+        if len(self.xy) <= max_points:
+            return [self]
+        axis = int(np.argmax(np.ptp(self.xy, axis=0)))
+        order = np.argsort(self.xy[:, axis], kind="stable")
+        halves = np.array_split(order, 2)
+        parts = (replace(self, xy=self.xy[half], elevation=self.elevation[half]) for half in halves)
+        return [block for part in parts for block in part.blocks(max_points)]
 
-def surface_of(points: ArrayLike, *, max_points: int, remove_plane: bool, seed: int) -> Surface:
+
+def surface_of(points: ArrayLike | Submap, *, max_points: int, remove_plane: bool, seed: int) -> Surface:
     """Draw at most `max_points` of the points (N, 3) at random and refer them to their centre.
 
     Raises

@@ -38,4 +38,8 @@ def associate(source: Features, target: Features, *, mutual: bool) -> Associatio
     norm = cv2.NORM_HAMMING if source.descriptors.dtype == np.uint8 else cv2.NORM_L2
     matches = cv2.BFMatcher(norm, crossCheck=mutual).match(source.descriptors, target.descriptors)
     pairs = np.array([(m.queryIdx, m.trainIdx) for m in matches], dtype=int).reshape(-1, 2)
-    return Associations(source.positions[pairs[:, 0]], target.positions[pairs[:, 1]])
+    # A keypoint with two orientations stands twice in the features; it is one spot of ground.
+    ends = np.hstack([source.positions[pairs[:, 0]], target.positions[pairs[:, 1]]])
+    _, first = np.unique(ends, axis=0, return_index=True)
+    ends = ends[np.sort(first)]
+    return Associations(ends[:, :2], ends[:, 2:])

@@ -85,7 +85,8 @@ def _planar_covariance(matched: Array, residuals: Array, floor: float) -> Array:
     jacobian[0::2, 0] = jacobian[1::2, 1] = 1.0
     jacobian[0::2, 2], jacobian[1::2, 2] = -matched[:, 1], matched[:, 0]
     scatter = (residuals**2).sum() / max(2 * len(matched) - 3, 1)
-    return max(scatter, floor**2) * np.linalg.inv(jacobian.T @ jacobian)
+    information = jacobian.T @ jacobian + 1e-9 * np.eye(3)  # inliers in one spot leave yaw open
+    return max(scatter, floor**2) * np.linalg.inv(information)
 
 
 def _at_source_origin(covariance_planar: Array, covariance_plane: Array, arm: Array, yaw: float) -> Array:

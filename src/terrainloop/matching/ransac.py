@@ -61,6 +61,8 @@ def register_by_ransac(
     if len(associations) < 2:
         return None
     draws = select_random_associations(len(associations), iterations, rng)
+    apart = np.linalg.norm(associations.source[draws[:, 0]] - associations.source[draws[:, 1]], axis=1)
+    draws = draws[apart > inlier_radius]  # closer than their own error, two points tell no rotation
     T = fit_se2(associations.source[draws], associations.target[draws])
     best = None
     for inliers in _distinct_by_falling_count(associations, T, inlier_radius):
@@ -91,7 +93,7 @@ def _distinct_by_falling_count(
     """Inlier sets of two or more, largest first, in the order of the draws, none of them twice."""
     step = max(1, CHUNK // len(associations))
     chunks = (T[start : start + step] for start in range(0, len(T), step))
-    counts = np.concatenate([get_inliers(associations, chunk, inlier_radius).sum(1) for chunk in chunks])
+    counts = np.concatenate([get_inliers(associations, chunk, inlier_radius).sum(1) for chunk in chunks] or [[]])
     seen = set()
     for index in np.argsort(-counts, kind="stable"):
         if counts[index] < 2:

@@ -1,0 +1,33 @@
+"""The command line: one file a command."""
+
+import logging
+import sys
+
+import typer
+
+from terrainloop.errors import TerrainLoopError
+
+app = typer.Typer(
+    name="terrainloop",
+    help="Loop closures from the shape of the ground.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def main() -> None:
+    """Run a command; exit with 0, 2 for input that cannot be worked with, 1 for a fault of ours."""
+    from terrainloop.cli import config, demo, detect, evaluate, map, match, simulate
+
+    for module in (demo, map, match, detect, evaluate, simulate, config):
+        app.command(module.__name__.rpartition(".")[2])(module.command)
+    try:
+        app()
+    except TerrainLoopError as error:
+        typer.echo(f"terrainloop: {error}", err=True)
+        sys.exit(2)
+    except Exception:
+        logging.getLogger(__name__).exception("a fault of ours, please report it with what follows")
+        sys.exit(1)

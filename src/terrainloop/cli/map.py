@@ -1,0 +1,104 @@
+"""``terrainloop map``: one gradient map."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from terrainloop.cli.terminal import (
+    ConfigOption,
+    Json,
+    PresetOption,
+    Quiet,
+    SeedOption,
+    Terminal,
+    Verbose,
+    WorkersOption,
+    read_settings,
+    worker_count,
+)
+from terrainloop.errors import TerrainLoopError
+
+if TYPE_CHECKING:
+    from terrainloop.gradient_map import GradientMap
+
+
+def command(
+    cloud: Annotated[Path, typer.Argument(help="Point cloud: PLY, PCD, LAS, LAZ, NPY, NPZ, XYZ; metres.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="map.npz, or map.tif for a GeoTIFF.")],
+    png: Annotated[bool, typer.Option("--png", help="Draw it too, beside the output.")] = False,
+    preset: PresetOption = "default",
+    config: ConfigOption = None,
+    seed: SeedOption = None,
+    workers: WorkersOption = 0,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Make the gradient map of one gravity-aligned cloud: elevation, gradient, variance."""
+    from terrainloop.detection.detector import map_submap
+    from terrainloop.io.clouds import read_cloud
+
+    terminal = Terminal.open(as_json, quiet, verbose)
+    settings = read_settings(preset, config, seed)
+    if output.suffix.lower() not in (".npz", ".tif", ".tiff"):
+        raise TerrainLoopError(
+            expected="an output that ends in .npz or .tif", found=str(output), mend="change -o"
+        )
+    submap = read_cloud(cloud)
+    with terminal.progress() as progress:
+        progress("map", 0, 1)
+        gradient_map = map_submap(submap, settings, workers=worker_count(workers)).gradient_map
+        progress("map", 1, 1)
+    _write(gradient_map, output)
+    written = [str(output)]
+    if png:
+        from terrainloop.report.figures import figure_map, save_figure
+
+        picture = output.with_suffix(".png")
+        save_figure(figure_map(submap, gradient_map), picture)
+        written.append(str(picture))
+    parameters, (rows, columns) = gradient_map.parameters, gradient_map.mask.shape
+    summary = {
+        "cloud": str(cloud),
+        "points": len(submap),
+        "repairs": list(submap.repairs),
+        "rows": rows,
+        "columns": columns,
+        "resolution_m": gradient_map.resolution,
+        "origin_m": list(gradient_map.origin),
+        "length_scale_m": parameters.length_scale,
+        "variance_m2": parameters.variance,
+        "noise_m": parameters.noise,
+        "known_share": float(gradient_map.mask.mean()),
+        "written": written,
+    }
+    terminal.result(
+        summary,
+        lambda console: console.print(
+            f"{len(submap)} points -> {columns} x {rows} pixels of {gradient_map.resolution:.3g} m, "
+            f"{gradient_map.mask.mean():.0%} known ground\n"
+            f"length scale {parameters.length_scale:.3g} m, relief {parameters.variance**0.5:.3g} m, "
+            f"noise {parameters.noise:.3g} m\nwritten: {', '.join(written)}"
+        ),
+    )
+
+
+def _write(gradient_map: "GradientMap", output: Path) -> None:
+    try:
+        if output.suffix.lower() == ".npz":
+            gradient_map.save(output)
+        else:
+            from terrainloop.io.rasters import write_geotiff
+
+            bands = ("elevation", "gradient_x", "gradient_y", "magnitude", "variance", "gradient_variance")
+            write_geotiff(
+                output,
+                {name: getattr(gradient_map, name) for name in bands},
+                gradient_map.origin,
+                gradient_map.resolution,
+            )
+    except OSError as error:
+        raise TerrainLoopError(
+            expected=f"to write {output}", found=str(error), mend="choose another -o"
+        ) from error

@@ -1,0 +1,46 @@
+"""``terrainloop simulate``: a mission with known truth."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose, output_folder
+
+
+def command(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Mission folder to write.")],
+    world: Annotated[str, typer.Option("--world", help="etna, morocco, mars or flat.")] = "etna",
+    seed: Annotated[int, typer.Option("--seed", help="Another seed, another place and drive.")] = 0,
+    submaps: Annotated[int, typer.Option("--submaps", help="How many; 16 have loops.")] = 16,
+    sensor: Annotated[str, typer.Option("--sensor", help="stereo or lidar.")] = "stereo",
+    as_json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Simulate a rover's drive over rough ground: clouds, odometry.tum that drifts, truth.tum."""
+    from terrainloop.simulation.missions import simulate_mission, write_mission
+
+    terminal = Terminal.open(as_json, quiet, verbose)
+    output_folder(output)
+    with terminal.progress() as progress:
+        mission = simulate_mission(
+            world, seed, submaps, sensor, progress=lambda done, total: progress("submaps", done, total)
+        )
+    write_mission(mission, output)
+    points = sum(len(cloud) for cloud in mission.clouds)
+    summary = {
+        "output": str(output),
+        "world": world,
+        "seed": seed,
+        "sensor": sensor,
+        "submaps": len(mission.clouds),
+        "points": points,
+    }
+    terminal.result(
+        summary,
+        lambda console: console.print(
+            f"{len(mission.clouds)} submaps, {points:,} points, written to {output}. "
+            f"Next: terrainloop detect {output} -o OUT"
+        ),
+    )

@@ -1,0 +1,127 @@
+"""What every command shares: its options, its voice, its progress bars."""
+
+import json
+import logging
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from terrainloop.errors import TerrainLoopError
+
+if TYPE_CHECKING:
+    from terrainloop.config import Settings
+
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else, on stdout.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more about what is done.")]
+PresetOption = Annotated[str, typer.Option("--preset", help="default, or paper: the pipeline as published.")]
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="YAML settings, see 'terrainloop config'. Excludes --preset.")
+]
+SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Of every random draw.")]
+WorkersOption = Annotated[
+    int, typer.Option("--workers", min=0, help="Parallel workers; 0: one a core. Results do not change.")
+]
+
+
+@dataclass(frozen=True)
+class Terminal:
+    """Where a command writes: results to stdout, the rest to stderr."""
+
+    as_json: bool
+    quiet: bool
+
+    @classmethod
+    def open(cls, as_json: bool, quiet: bool, verbose: bool) -> "Terminal":
+        """Set up logging as the user asked, and return the terminal."""
+        level = logging.ERROR if quiet else logging.INFO if verbose else logging.WARNING
+        handler = RichHandler(console=Console(stderr=True), show_path=False, show_time=False)
+        logging.basicConfig(level=level, format="%(message)s", handlers=[handler], force=True)
+        return cls(as_json, quiet)
+
+    def result(self, value: Any, show: Callable[[Console], None]) -> None:
+        """Print the result once: as JSON if asked for, else as `show` does unless quiet."""
+        if self.as_json:
+            typer.echo(json.dumps(_plain(value), indent=2, allow_nan=False))
+        elif not self.quiet:
+            show(Console(highlight=False))
+
+    def say(self, text: str) -> None:
+        """A remark on stderr."""
+        if not self.quiet:
+            Console(stderr=True, highlight=False).print(text)
+
+    @contextmanager
+    def progress(self) -> Iterator[Callable[[str, int, int], None]]:
+        """A bar for each stage; yields the callable (stage, done, total) that moves them."""
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        hidden = self.quiet or self.as_json
+        with Progress(*columns, console=Console(stderr=True), disable=hidden) as bars:
+            tasks: dict[str, Any] = {}
+
+            def move(stage: str, done: int, total: int) -> None:
+                if stage not in tasks:
+                    tasks[stage] = bars.add_task(stage, total=total)
+                bars.update(tasks[stage], completed=done, total=total)
+
+            yield move
+
+
+def _plain(value: Any) -> Any:
+    """The value with NaN and infinity, which JSON lacks, as null."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def table_of(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """A table with numbers to the right and the last column to the left."""
+    table = Table(title=title, title_justify="left", show_edge=False, pad_edge=False)
+    for number, column in enumerate(columns):
+        text = number in (0, len(columns) - 1)
+        table.add_column(column, justify="left" if text else "right", no_wrap=number < len(columns) - 1)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def read_settings(preset: str, config: Path | None, seed: int | None) -> "Settings":
+    """Settings from the options that every detecting command has."""
+    from terrainloop.config import Settings
+
+    if config is not None and preset != "default":
+        raise TerrainLoopError(
+            expected="either --preset or --config", found="both", mend="put the preset's changes in the file"
+        )
+    settings = Settings.from_yaml(config) if config is not None else Settings.preset(preset)
+    return settings if seed is None else settings.model_copy(update={"seed": seed})
+
+
+def worker_count(workers: int) -> int:
+    """As asked for, or one a core."""
+    if workers:
+        return workers
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def output_folder(path: Path) -> Path:
+    """The folder, made if it is not there."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TerrainLoopError(
+            expected=f"a folder to write at {path}", found=str(error), mend="choose another -o"
+        ) from error
+    return path

@@ -1,0 +1,212 @@
+"""The paper's pictures: a gradient map in the making, two maps matched, precision and recall."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import ConnectionPatch
+from numpy.typing import NDArray
+
+from terrainloop.evaluation.precision_recall import OperatingPoint
+from terrainloop.geometry import Array, transform
+from terrainloop.gradient_map import GradientMap
+from terrainloop.loop import LoopCandidate
+from terrainloop.matching.correspondences import Associations
+from terrainloop.matching.ssd import warp
+from terrainloop.submap import Submap
+
+SOURCE_COLOUR, TARGET_COLOUR = "#d1495b", "#00798c"
+DRAWN_POINTS = 40_000  # more do not show at this size
+
+
+def figure_map(submap: Submap, gradient_map: GradientMap) -> Figure:
+    """How a cloud becomes a gradient map: cloud, elevation, variance, gx, magnitude (paper, Fig. 3)."""
+    figure = Figure(figsize=(13, 7.5), layout="constrained")
+    figure.suptitle(
+        f"{submap.name}: {len(submap):,} points, length scale {gradient_map.parameters.length_scale:.3g} m, "
+        f"{gradient_map.resolution:.3g} m per pixel"
+    )
+    first = figure.add_subplot(2, 3, 1)
+    drawn = submap.points[:: max(1, len(submap) // DRAWN_POINTS)]
+    dots = first.scatter(drawn[:, 0], drawn[:, 1], c=drawn[:, 2], s=0.3, cmap="gist_earth", linewidths=0)
+    _finish(first, "(a) point cloud, height")
+    figure.colorbar(dots, ax=first, label="m")
+    slope = np.abs(gradient_map.magnitude[gradient_map.mask])
+    steep = float(np.percentile(slope, 99)) if slope.size else 1.0
+    panels = [
+        ("(b) elevation", gradient_map.elevation, "gist_earth", "m", {}),
+        ("(c) standard deviation", np.sqrt(gradient_map.variance), "inferno", "m", {}),
+        ("(d) gradient along x", gradient_map.gradient_x, "RdBu", "", {"vmin": -steep, "vmax": steep}),
+        ("(e) gradient along y", gradient_map.gradient_y, "RdBu", "", {"vmin": -steep, "vmax": steep}),
+        ("(f) gradient map", gradient_map.magnitude, "gray", "", {"vmin": 0.0, "vmax": steep}),
+    ]
+    for place, (title, image, colours, unit, limits) in enumerate(panels, start=2):
+        axes = figure.add_subplot(2, 3, place)
+        shown = axes.imshow(image, origin="lower", extent=_extent(gradient_map), cmap=colours, **limits)
+        if place > 3:
+            _veil(axes, gradient_map, "white")
+        _finish(axes, title)
+        figure.colorbar(shown, ax=axes, label=unit)
+    return figure
+
+
+def figure_match(
+    source_map: GradientMap,
+    target_map: GradientMap,
+    candidate: LoopCandidate,
+    associations: Associations,
+    inliers: NDArray[np.bool_],
+) -> Figure:
+    """Two maps, their associations, and the maps laid over each other (paper, Fig. 4)."""
+    figure = Figure(figsize=(13, 11), layout="constrained")
+    verdict = "loop closure" if candidate else "no loop closure"
+    figure.suptitle(f"{candidate.source} to {candidate.target}: {verdict} ({candidate.reason})")
+    grid = figure.add_gridspec(2, 2)
+    left, right = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
+    for axes, gradient_map, role, name in (
+        (left, source_map, "source", candidate.source),
+        (right, target_map, "target", candidate.target),
+    ):
+        _show_magnitude(axes, gradient_map)
+        _finish(axes, f"{role} {name}")
+    _draw_associations(figure, left, right, associations, inliers)
+    if np.isfinite(candidate.T_target_source).all():
+        _overlay(figure.add_subplot(grid[1, 0]), source_map, target_map, candidate.T_target_source)
+        _show_both(figure.add_subplot(grid[1, 1]), source_map, target_map, candidate.T_target_source)
+    return figure
+
+
+def figure_mission(
+    names: Sequence[str],
+    poses: Array,
+    hulls: Sequence[Array],
+    loops: Sequence[LoopCandidate],
+    *,
+    title: str,
+) -> Figure:
+    """Submaps where their poses put them, and the loops found between them.
+
+    Parameters
+    ----------
+    names : sequence of str, (M,)
+    poses : array, (M, 4, 4)
+        T_world_submap.
+    hulls : sequence of (K, 2) arrays
+        Outline of each submap in its own frame, metres.
+    loops : sequence of LoopCandidate
+    title : str
+    """
+    figure = Figure(figsize=(9, 8), layout="constrained")
+    axes = figure.add_subplot()
+    index = {name: number for number, name in enumerate(names)}
+    for hull, pose in zip(hulls, poses, strict=True):
+        outline = transform(pose, np.c_[hull, np.zeros(len(hull))])
+        axes.fill(outline[:, 0], outline[:, 1], color=TARGET_COLOUR, alpha=0.06, linewidth=0)
+        axes.plot(*np.vstack([outline, outline[:1]])[:, :2].T, color=TARGET_COLOUR, alpha=0.35, linewidth=0.7)
+    axes.plot(poses[:, 0, 3], poses[:, 1, 3], "o-", color="0.3", markersize=4, linewidth=1, label="path")
+    for number, loop in enumerate(loops):
+        ends = np.array([poses[index[loop.source], :2, 3], poses[index[loop.target], :2, 3]])
+        axes.plot(*ends.T, color=SOURCE_COLOUR, linewidth=1.6, label=None if number else "loop closure")
+    for name, pose in zip(names, poses, strict=True):
+        axes.annotate(name.lstrip("0") or "0", pose[:2, 3], fontsize=7, xytext=(3, 3), textcoords="offset points")
+    axes.legend(loc="best")
+    _finish(axes, title)
+    return figure
+
+
+def figure_precision_recall(points: Sequence[OperatingPoint], title: str) -> Figure:
+    """Precision against recall, and both against the inlier threshold (paper, Figs. 8 and 9)."""
+    figure = Figure(figsize=(10, 4.5), layout="constrained")
+    curve, by_threshold = figure.subplots(1, 2)
+    recall, precision = [p.recall for p in points], [p.precision for p in points]
+    thresholds = [p.threshold for p in points]
+    curve.plot(recall, precision, "o-", color=TARGET_COLOUR, markersize=4)
+    for point in points:
+        curve.annotate(f"{point.threshold:g}", (point.recall, point.precision), fontsize=7)
+    curve.set(xlabel="recall", ylabel="precision", title=title)
+    by_threshold.plot(thresholds, precision, "o-", color=TARGET_COLOUR, markersize=4, label="precision")
+    by_threshold.plot(thresholds, recall, "s--", color=SOURCE_COLOUR, markersize=4, label="recall")
+    by_threshold.set(xlabel="least number of inliers n", title="over the inlier threshold")
+    by_threshold.legend()
+    for axes in (curve, by_threshold):
+        axes.set_ylim(-0.03, 1.03)
+        axes.grid(alpha=0.3)
+    curve.set_xlim(-0.03, 1.03)
+    return figure
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a PNG; the same figure gives the same bytes."""
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+
+
+def _extent(gradient_map: GradientMap) -> tuple[float, float, float, float]:
+    (x, y), r, (rows, columns) = gradient_map.origin, gradient_map.resolution, gradient_map.mask.shape
+    return x - r / 2, x + r * (columns - 0.5), y - r / 2, y + r * (rows - 0.5)
+
+
+def _veil(axes: Axes, gradient_map: GradientMap, colour: str) -> None:
+    """Cover the ground that is not known."""
+    veil = np.zeros((*gradient_map.mask.shape, 4))
+    veil[..., :3] = 1.0 if colour == "white" else 0.0
+    veil[..., 3] = np.where(gradient_map.mask, 0.0, 0.85)
+    axes.imshow(veil, origin="lower", extent=_extent(gradient_map))
+
+
+def _show_magnitude(axes: Axes, gradient_map: GradientMap) -> None:
+    known = gradient_map.magnitude[gradient_map.mask]
+    steep = float(np.percentile(known, 99)) if known.size else 1.0
+    axes.imshow(
+        gradient_map.magnitude, origin="lower", extent=_extent(gradient_map), cmap="gray", vmin=0, vmax=steep
+    )
+    _veil(axes, gradient_map, "white")
+
+
+def _draw_associations(
+    figure: Figure, left: Axes, right: Axes, associations: Associations, inliers: NDArray[np.bool_]
+) -> None:
+    for colour, chosen, width in (("0.6", ~inliers, 0.3), (SOURCE_COLOUR, inliers, 1.2)):
+        left.plot(*associations.source[chosen].T, ".", color=colour, markersize=4)
+        right.plot(*associations.target[chosen].T, ".", color=colour, markersize=4)
+        for a, b in zip(associations.source[chosen], associations.target[chosen], strict=True):
+            line = ConnectionPatch(a, b, "data", "data", axesA=left, axesB=right, color=colour, linewidth=width)
+            line.set_in_layout(False)
+            figure.add_artist(line)
+
+
+def _planar(T_target_source: Array) -> Array:
+    """The part of an SE(3) transform, nearly upright, that acts in the plane."""
+    return T_target_source[np.ix_([0, 1, 3], [0, 1, 3])]
+
+
+def _overlay(axes: Axes, source_map: GradientMap, target_map: GradientMap, T_target_source: Array) -> None:
+    """Source in one colour over the target in its opposite: grey where they agree."""
+    moved = warp(source_map.magnitude, source_map, target_map, _planar(T_target_source))
+    known = warp(source_map.mask.astype(np.float32), source_map, target_map, _planar(T_target_source)) > 0.999
+    both = known & target_map.mask
+    steep = float(np.percentile(target_map.magnitude[target_map.mask], 99)) if target_map.mask.any() else 1.0
+    image = np.ones((*both.shape, 3))
+    image[both, 0] = np.clip(moved / steep, 0, 1)[both]
+    image[both, 1] = image[both, 2] = np.clip(target_map.magnitude / steep, 0, 1)[both]
+    axes.imshow(image, origin="lower", extent=_extent(target_map))
+    _finish(axes, "aligned, shared ground: grey agrees, red source only, cyan target only")
+
+
+def _show_both(axes: Axes, source_map: GradientMap, target_map: GradientMap, T_target_source: Array) -> None:
+    """Both maps' known ground, the source's moved into the target's frame."""
+    for gradient_map, T, colour in (
+        (target_map, np.eye(3), TARGET_COLOUR),
+        (source_map, _planar(T_target_source), SOURCE_COLOUR),
+    ):
+        rows, columns = np.nonzero(gradient_map.mask)
+        step = max(1, len(rows) // DRAWN_POINTS)
+        ground = np.stack([columns, rows], axis=1)[::step] * gradient_map.resolution + gradient_map.origin
+        axes.plot(*transform(T, ground).T, ".", color=colour, markersize=1, alpha=0.25)
+    _finish(axes, "known ground: source (red) over target (blue), target frame")
+
+
+def _finish(axes: Axes, title: str) -> None:
+    axes.set(title=title, xlabel="x, m", ylabel="y, m", aspect="equal")
+    axes.title.set_fontsize(10)
