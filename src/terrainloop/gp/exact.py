@@ -8,11 +8,12 @@ With training points X, elevations z and A = [K(X, X) + noise^2 I]^-1, at a quer
     its variance    variance / l^2 - dk(x, X)/dx A dk(X, x)/dx (Saerkkae, ICANN 2011)
 """
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky
 from scipy.linalg.lapack import dpotri
 from threadpoolctl import threadpool_limits
@@ -21,7 +22,10 @@ from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.kernel import Array, Hyperparameters, factor, squared_distances
 
 REACH = 8.0  # length scales beyond which the kernel, below 1.3e-14, is lost in float64 rounding
-TILE = 1.5  # side of the tiles the variance is computed in, length scales
+TILE = 3.0  # side of the tiles the variance is computed in, length scales
+NODES = 20  # along an axis of a tile: they interpolate the kernel to 1e-11
+MAX_TILE = 64  # pixels along an axis of a tile, which bounds memory
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,45 +117,62 @@ def _variances(
 ) -> tuple[Array, Array]:
     """Variance of the elevation, and mean variance of the gradient components, (H, W) each.
 
-    Tile by tile, so that memory stays bounded and only points within reach of a tile take part.
+    Over a tile, k(x, X) is a polynomial in x to within rounding: with N its values at Chebyshev
+    nodes and b(x) the interpolation weights, k(x, X) = b(x) N. So k A k' = b (N A N') b', and a
+    derivative of k is one of b. Only the points within reach of a tile take part.
     """
     variance, gradient_variance = np.empty((len(y), len(x))), np.empty((len(y), len(x)))
+    side, reach = TILE * parameters.length_scale, REACH * parameters.length_scale
+    prior = parameters.variance / parameters.length_scale**2
 
     def solve(tile: tuple[slice, slice]) -> None:
-        rows, columns = tile
-        near = _within_reach(xy, x[columns], y[rows], REACH * parameters.length_scale)
-        kx, dkx = factor(x[columns], xy[near, 0], parameters.length_scale)
-        ky, dky = factor(y[rows], xy[near, 1], parameters.length_scale)
+        nodes_y, weight_y, slope_y = _interpolation(y[tile[0]], side)
+        nodes_x, weight_x, slope_x = _interpolation(x[tile[1]], side)
+        near = _within_reach(xy, nodes_x, nodes_y, reach)
+        kx = factor(nodes_x, xy[near, 0], parameters.length_scale)[0]
+        ky = factor(nodes_y, xy[near, 1], parameters.length_scale)[0]
+        k = parameters.variance * (ky[:, None, :] * kx[None, :, :]).reshape(-1, max(len(near), 1))
         local = precision if len(near) == len(xy) else precision[np.ix_(near, near)]
-        explained = [_quadratic(local, a, b) for a, b in ((ky, kx), (ky, dkx), (dky, kx))]
-        scale = parameters.variance**2
-        variance[tile] = parameters.variance - scale * explained[0]
-        prior = parameters.variance / parameters.length_scale**2
-        gradient_variance[tile] = prior - scale * (explained[1] + explained[2]) / 2
+        explained = k @ local @ k.T
+        variance[tile] = parameters.variance - _quadratic(explained, weight_y, weight_x)
+        by_both = _quadratic(explained, weight_y, slope_x) + _quadratic(explained, slope_y, weight_x)
+        gradient_variance[tile] = prior - by_both / 2
 
-    side = TILE * parameters.length_scale
     tiles = [(rows, columns) for rows in _chunks(y, side) for columns in _chunks(x, side)]
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(solve, tiles))
-    rounding = 1e-12  # a variance is positive even where cancellation leaves less
-    np.maximum(variance, rounding * parameters.variance, out=variance)
-    np.maximum(gradient_variance, rounding * parameters.variance, out=gradient_variance)
+    # A variance is positive even where cancellation leaves less.
+    np.maximum(variance, ROUNDING * parameters.variance, out=variance)
+    np.maximum(gradient_variance, ROUNDING * prior, out=gradient_variance)
     return variance, gradient_variance
 
 
-def _quadratic(precision: Array, ky: Array, kx: Array) -> Array:
-    """k' A k at every pixel of a tile whose separable kernel factors are given; (rows, columns)."""
-    k = (ky[:, None, :] * kx[None, :, :]).reshape(len(ky) * len(kx), len(precision))
-    return np.einsum("ij,ij->i", k @ precision, k).reshape(len(ky), len(kx))
+def _interpolation(coordinates: Array, side: float) -> tuple[Array, Array, Array]:
+    """Chebyshev nodes (n,) around the coordinates (M,); weights and their derivatives (M, n)."""
+    middle, half = (coordinates[0] + coordinates[-1]) / 2, side / 2
+    nodes = chebyshev.chebpts1(NODES)
+    from_values = np.linalg.inv(chebyshev.chebvander(nodes, NODES - 1))
+    derivatives = chebyshev.chebder(np.eye(NODES)) @ from_values / half
+    at = (coordinates - middle) / half
+    weights = chebyshev.chebvander(at, NODES - 1) @ from_values
+    return middle + half * nodes, weights, chebyshev.chebvander(at, NODES - 2) @ derivatives
 
 
-def _within_reach(xy: Array, x: Array, y: Array, reach: float) -> np.ndarray:
-    inside_x = (xy[:, 0] >= x[0] - reach) & (xy[:, 0] <= x[-1] + reach)
-    return np.flatnonzero(inside_x & (xy[:, 1] >= y[0] - reach) & (xy[:, 1] <= y[-1] + reach))
+def _quadratic(explained: Array, weight_y: Array, weight_x: Array) -> Array:
+    """b E b' at every pixel of a tile, with b the product of the two axes' weights; (rows, columns)."""
+    rows, columns = len(weight_y), len(weight_x)
+    b = (weight_y[:, None, :, None] * weight_x[None, :, None, :]).reshape(rows * columns, -1)
+    return np.einsum("ij,ij->i", b @ explained, b).reshape(rows, columns)
 
 
-def _chunks(coordinates: Array, side: float) -> Iterator[slice]:
-    """Slices of at most 32 evenly spaced coordinates that span at most `side` metres."""
+def _within_reach(xy: Array, x: Array, y: Array, reach: float) -> NDArray[np.intp]:
+    inside_x = (xy[:, 0] >= x.min() - reach) & (xy[:, 0] <= x.max() + reach)
+    return np.flatnonzero(inside_x & (xy[:, 1] >= y.min() - reach) & (xy[:, 1] <= y.max() + reach))
+
+
+def _chunks(coordinates: Array, side: float) -> list[slice]:
+    """Slices of evenly spaced coordinates that span at most `side` metres, nearly equal in length."""
     spacing = coordinates[1] - coordinates[0] if len(coordinates) > 1 else side
-    step = int(np.clip(side / spacing, 1, 32))
-    return (slice(start, start + step) for start in range(0, len(coordinates), step))
+    count = -(-len(coordinates) // int(np.clip(side / spacing, 1, MAX_TILE)))
+    edges = np.linspace(0, len(coordinates), count + 1).astype(int)
+    return [slice(start, stop) for start, stop in zip(edges[:-1], edges[1:], strict=True)]
