@@ -21,9 +21,9 @@ from threadpoolctl import threadpool_limits
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.kernel import Array, Hyperparameters, factor, squared_distances
 
-REACH = 8.0  # length scales beyond which the kernel, below 1.3e-14, is lost in float64 rounding
-TILE = 3.0  # side of the tiles the variance is computed in, length scales
-NODES = 20  # along an axis of a tile: they interpolate the kernel to 1e-11
+REACH = 7.0  # length scales beyond which the kernel, below 3e-11, no longer counts
+TILE = 6.0  # side of the tiles the variance is computed in, length scales
+NODES = 30  # along an axis of a tile: they interpolate the kernel to 1e-11
 MAX_TILE = 64  # pixels along an axis of a tile, which bounds memory
 ROUNDING = 1e-12
 
