@@ -8,8 +8,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from terrainloop.errors import TerrainLoopError
 
-PresetName = Literal["default", "paper"]
-
 
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -68,7 +66,7 @@ class Settings(_Frozen):
     seed: int = Field(0, ge=0, description="of every random draw")
 
     @classmethod
-    def preset(cls, name: PresetName) -> "Settings":
+    def preset(cls, name: str) -> "Settings":
         """Settings by name: ``default``, or ``paper`` for the pipeline of Le Gentil et al. (2020).
 
         Raises
@@ -107,7 +105,9 @@ class Settings(_Frozen):
         try:
             content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise TerrainLoopError(expected=f"YAML settings in {path}", found=_line(error), mend=mend) from error
+            raise TerrainLoopError(
+                expected=f"YAML settings in {path}", found=_line(error), mend=mend
+            ) from error
         try:
             return cls.model_validate({} if content is None else content)
         except ValidationError as error:

@@ -59,7 +59,9 @@ def command(
         settings = settings.model_copy(update={"skip_recent": 0})
     detector, records = run_detection(load_mission(mission), settings, output, workers, terminal)
     summary = summarise(detector.candidates, records)
-    terminal.result(summary | {"output": str(output)}, lambda console: show(console, detector, records, output))
+    terminal.result(
+        summary | {"output": str(output)}, lambda console: show(console, detector, records, output)
+    )
 
 
 def run_detection(
@@ -112,12 +114,21 @@ def summarise(candidates: Sequence["LoopCandidate"], records: Sequence["SubmapRe
     }
 
 
-def show(
-    console: Console, detector: "LoopDetector", records: Sequence["SubmapRecord"], output: Path
-) -> None:
+def show(console: Console, detector: "LoopDetector", records: Sequence["SubmapRecord"], output: Path) -> None:
     """The run as a table and a few sentences."""
     loops = [candidate for candidate in detector.candidates if candidate]
-    columns = ["source", "target", "x, m", "y, m", "z, m", "yaw, deg", "+/- m", "inliers", "overlap", "reason"]
+    columns = [
+        "source",
+        "target",
+        "x, m",
+        "y, m",
+        "z, m",
+        "yaw, deg",
+        "+/- m",
+        "inliers",
+        "overlap",
+        "reason",
+    ]
     console.print(table_of("Loop closures", columns, [_row(loop) for loop in loops]))
     usable = sum(record.status == "ok" for record in records)
     console.print(
@@ -129,7 +140,9 @@ def show(
     for record in records:
         if record.status == "broken":
             console.print(f"  left out {record.name}: {record.notes}")
-    console.print(f"Written to {output}: loops.csv, pairs.csv (why each was rejected), submaps.csv, config.yaml")
+    console.print(
+        f"Written to {output}: loops.csv, pairs.csv (why each was rejected), submaps.csv, config.yaml"
+    )
 
 
 def rejections(candidates: Sequence["LoopCandidate"]) -> list[tuple[int, str]]:

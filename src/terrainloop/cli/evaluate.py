@@ -158,7 +158,7 @@ def _read_sessions(path: Path) -> dict[str, str]:
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = [row for row in csv.reader(file) if row]
-        return {name: session for name, session in rows[1:]}
+        return dict(rows[1:])
     except (OSError, ValueError, IndexError) as error:
         raise TerrainLoopError(
             expected=f"a header and two columns, cloud and session, in {path}",

@@ -118,4 +118,6 @@ def _show(console: Console, candidate: "LoopCandidate") -> None:
         ("roll", "pitch", "yaw"), np.degrees(values[3:]), np.degrees(spread[3:]), strict=True
     ):
         console.print(f"  {name:6}{value:10.3f} +/- {sigma:.3f} deg")
-    console.print(f"  overlap {candidate.overlap:.0%}; takes points of {candidate.source} into {candidate.target}")
+    console.print(
+        f"  overlap {candidate.overlap:.0%}; takes points of {candidate.source} into {candidate.target}"
+    )

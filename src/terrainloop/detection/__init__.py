@@ -1,0 +1,1 @@
+"""Detection: the database of submaps and the loops found in it."""

@@ -112,4 +112,6 @@ def _map_cloud(
         submap = mission.read(index)
         return MappedCloud(submap_record(submap), map_submap(submap, settings, parameters))
     except TerrainLoopError as error:
-        return MappedCloud(SubmapRecord(mission.names[index], float(index), 0, "broken", notes=str(error)), None)
+        return MappedCloud(
+            SubmapRecord(mission.names[index], float(index), 0, "broken", notes=str(error)), None
+        )

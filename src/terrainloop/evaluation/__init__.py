@@ -1,0 +1,1 @@
+"""Evaluation: loop candidates held against the truth."""

@@ -10,6 +10,7 @@ With training points X, elevations z and A = [K(X, X) + noise^2 I]^-1, at a quer
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -159,7 +160,7 @@ def _interpolation(coordinates: Array, side: float) -> tuple[Array, Array, Array
 
 
 def _quadratic(explained: Array, weight_y: Array, weight_x: Array) -> Array:
-    """b E b' at every pixel of a tile, with b the product of the two axes' weights; (rows, columns)."""
+    """The form b E b' at every pixel of a tile, with b the product of the axes' weights; (rows, columns)."""
     rows, columns = len(weight_y), len(weight_x)
     b = (weight_y[:, None, :, None] * weight_x[None, :, None, :]).reshape(rows * columns, -1)
     return np.einsum("ij,ij->i", b @ explained, b).reshape(rows, columns)
@@ -175,4 +176,4 @@ def _chunks(coordinates: Array, side: float) -> list[slice]:
     spacing = coordinates[1] - coordinates[0] if len(coordinates) > 1 else side
     count = -(-len(coordinates) // int(np.clip(side / spacing, 1, MAX_TILE)))
     edges = np.linspace(0, len(coordinates), count + 1).astype(int)
-    return [slice(start, stop) for start, stop in zip(edges[:-1], edges[1:], strict=True)]
+    return [slice(start, stop) for start, stop in pairwise(edges)]

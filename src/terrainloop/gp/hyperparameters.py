@@ -23,9 +23,7 @@ BLOCK_POINTS = 600
 SPAN = {"length_scale": 10.0, "variance": 1e3, "noise": 1e3}
 
 
-def negative_log_likelihood(
-    log_parameters: Array, xy: Array, elevation: Array
-) -> tuple[float, Array]:
+def negative_log_likelihood(log_parameters: Array, xy: Array, elevation: Array) -> tuple[float, Array]:
     """-log p(z | X) and its gradient with respect to the logarithms of the hyperparameters.
 
     With a = [K + noise^2 I]^-1 z, the derivative along any parameter t is

@@ -65,7 +65,7 @@ def surface_of(points: ArrayLike | Submap, *, max_points: int, remove_plane: boo
     TerrainLoopError
         If the points make no submap (see `Submap`).
     """
-    cloud = points.points if isinstance(points, Submap) else Submap(points).points
+    cloud = points.points if isinstance(points, Submap) else Submap(np.asarray(points)).points
     if len(cloud) > max_points:
         rng = np.random.default_rng(seed)
         cloud = cloud[np.sort(rng.choice(len(cloud), max_points, replace=False))]

@@ -64,9 +64,7 @@ def _independent_area(gradient_map: GradientMap) -> float:
     return float(np.pi * gradient_map.parameters.length_scale**2)
 
 
-def _fit_plane(
-    ground: Array, difference: NDArray[np.floating], independent: float
-) -> tuple[Array, Array]:
+def _fit_plane(ground: Array, difference: NDArray[np.floating], independent: float) -> tuple[Array, Array]:
     """(z, w_x, w_y) by least squares with outliers clipped once; covariance for `independent` samples."""
     design = np.stack([np.ones(len(ground)), ground[:, 1], -ground[:, 0]], axis=1)
     keep = np.ones(len(difference), dtype=bool)

@@ -93,7 +93,9 @@ def _distinct_by_falling_count(
     """Inlier sets of two or more, largest first, in the order of the draws, none of them twice."""
     step = max(1, CHUNK // len(associations))
     chunks = (T[start : start + step] for start in range(0, len(T), step))
-    counts = np.concatenate([get_inliers(associations, chunk, inlier_radius).sum(1) for chunk in chunks] or [[]])
+    counts = np.concatenate(
+        [get_inliers(associations, chunk, inlier_radius).sum(1) for chunk in chunks] or [[]]
+    )
     seen = set()
     for index in np.argsort(-counts, kind="stable"):
         if counts[index] < 2:

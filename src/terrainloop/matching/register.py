@@ -1,4 +1,4 @@
-"""The one entry to matching: are two gradient maps of the same place, and how do they lie?"""
+"""The one entry to matching: whether two gradient maps show the same place, and how they lie."""
 
 import zlib
 

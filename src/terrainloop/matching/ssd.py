@@ -63,7 +63,10 @@ def warp(
     pixels_of_target = _metres_from_pixels(target)
     lookup = np.linalg.inv(_metres_from_pixels(source)) @ inverse(T_target_source) @ pixels_of_target
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(image, lookup[:2], target.mask.shape[::-1], flags=flags, borderValue=0.0)
+    size = (target.mask.shape[1], target.mask.shape[0])
+    return cv2.warpAffine(image, lookup[:2], size, flags=flags, borderValue=0.0).astype(
+        np.float32, copy=False
+    )
 
 
 def _metres_from_pixels(gradient_map: GradientMap) -> Array:

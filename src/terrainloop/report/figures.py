@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -35,7 +36,7 @@ def figure_map(submap: Submap, gradient_map: GradientMap) -> Figure:
     figure.colorbar(dots, ax=first, label="m")
     slope = np.abs(gradient_map.magnitude[gradient_map.mask])
     steep = float(np.percentile(slope, 99)) if slope.size else 1.0
-    panels = [
+    panels: list[tuple[str, NDArray[np.float32], str, str, dict[str, Any]]] = [
         ("(b) elevation", gradient_map.elevation, "gist_earth", "m", {}),
         ("(c) standard deviation", np.sqrt(gradient_map.variance), "inferno", "m", {}),
         ("(d) gradient along x", gradient_map.gradient_x, "RdBu", "", {"vmin": -steep, "vmax": steep}),
@@ -46,7 +47,7 @@ def figure_map(submap: Submap, gradient_map: GradientMap) -> Figure:
         axes = figure.add_subplot(2, 3, place)
         shown = axes.imshow(image, origin="lower", extent=_extent(gradient_map), cmap=colours, **limits)
         if place > 3:
-            _veil(axes, gradient_map, "white")
+            _veil(axes, gradient_map)
         _finish(axes, title)
         figure.colorbar(shown, ax=axes, label=unit)
     return figure
@@ -110,7 +111,9 @@ def figure_mission(
         ends = np.array([poses[index[loop.source], :2, 3], poses[index[loop.target], :2, 3]])
         axes.plot(*ends.T, color=SOURCE_COLOUR, linewidth=1.6, label=None if number else "loop closure")
     for name, pose in zip(names, poses, strict=True):
-        axes.annotate(name.lstrip("0") or "0", pose[:2, 3], fontsize=7, xytext=(3, 3), textcoords="offset points")
+        axes.annotate(
+            name.lstrip("0") or "0", pose[:2, 3], fontsize=7, xytext=(3, 3), textcoords="offset points"
+        )
     axes.legend(loc="best")
     _finish(axes, title)
     return figure
@@ -147,10 +150,9 @@ def _extent(gradient_map: GradientMap) -> tuple[float, float, float, float]:
     return x - r / 2, x + r * (columns - 0.5), y - r / 2, y + r * (rows - 0.5)
 
 
-def _veil(axes: Axes, gradient_map: GradientMap, colour: str) -> None:
-    """Cover the ground that is not known."""
-    veil = np.zeros((*gradient_map.mask.shape, 4))
-    veil[..., :3] = 1.0 if colour == "white" else 0.0
+def _veil(axes: Axes, gradient_map: GradientMap) -> None:
+    """Cover the ground that is not known with white."""
+    veil = np.ones((*gradient_map.mask.shape, 4))
     veil[..., 3] = np.where(gradient_map.mask, 0.0, 0.85)
     axes.imshow(veil, origin="lower", extent=_extent(gradient_map))
 
@@ -161,7 +163,7 @@ def _show_magnitude(axes: Axes, gradient_map: GradientMap) -> None:
     axes.imshow(
         gradient_map.magnitude, origin="lower", extent=_extent(gradient_map), cmap="gray", vmin=0, vmax=steep
     )
-    _veil(axes, gradient_map, "white")
+    _veil(axes, gradient_map)
 
 
 def _draw_associations(
@@ -171,7 +173,9 @@ def _draw_associations(
         left.plot(*associations.source[chosen].T, ".", color=colour, markersize=4)
         right.plot(*associations.target[chosen].T, ".", color=colour, markersize=4)
         for a, b in zip(associations.source[chosen], associations.target[chosen], strict=True):
-            line = ConnectionPatch(a, b, "data", "data", axesA=left, axesB=right, color=colour, linewidth=width)
+            line = ConnectionPatch(
+                a, b, "data", "data", axesA=left, axesB=right, color=colour, linewidth=width
+            )
             line.set_in_layout(False)
             figure.add_artist(line)
 
