@@ -45,14 +45,13 @@ class FeatureSettings(_Frozen):
 class MatchSettings(_Frozen):
     """Algorithm 1: SE(2) RANSAC and its acceptance."""
 
-    mutual: bool = Field(True, description="associations must be nearest neighbours both ways")
     iterations: int = Field(5000, ge=1, description="pairs of associations drawn")
     inlier_radius: float | None = Field(
         None, gt=0, description="largest distance of an inlier, m; null: half the length scale"
     )
     min_inliers: int = Field(5, ge=2, description="inliers that make a loop (n_min)")
     max_ssd_ratio: float = Field(
-        1.0, gt=0, description="largest SSD, as a share of what unrelated ground would give"
+        0.5, gt=0, description="largest SSD, as a share of what unrelated ground would give"
     )
 
 
@@ -86,7 +85,7 @@ class Settings(_Frozen):
                     remove_plane=False,
                 ),
                 features=FeatureSettings(kind="surf"),
-                match=MatchSettings(mutual=False),
+                match=MatchSettings(max_ssd_ratio=1.0),
             )
         raise TerrainLoopError(
             expected="preset 'default' or 'paper'", found=repr(name), mend="name one of the two"

@@ -28,7 +28,8 @@ class LoopCandidate:
     overlap : float
         Shared part of the two maps' known ground, intersection over union, 0 to 1.
     score : float
-        Higher is surer; comparable across the pairs of a mission.
+        Higher is surer; comparable across the pairs of a mission: the inliers, discounted by the
+        share of the gradients that they leave unexplained, n (1 - ssd_ratio).
     accepted : bool
     reason : str
         In words, why it was accepted or not.

@@ -79,7 +79,7 @@ def draw(
     from terrainloop.matching.register import align
     from terrainloop.report.figures import figure_match, save_figure
 
-    associations = associate(source.features, target.features, mutual=settings.match.mutual)
+    associations = associate(source.features, target.features)
     names = (candidate.source, candidate.target)
     alignment = align(source.gradient_map, target.gradient_map, associations, settings, names)
     inliers = np.zeros(len(associations), dtype=bool) if alignment is None else alignment.inliers

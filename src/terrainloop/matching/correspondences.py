@@ -23,20 +23,18 @@ class Associations:
         return len(self.source)
 
 
-def associate(source: Features, target: Features, *, mutual: bool) -> Associations:
-    """Pair each source keypoint with the target keypoint whose descriptor is nearest.
+def associate(source: Features, target: Features) -> Associations:
+    """Pair the keypoints of two maps that are each other's nearest by descriptor.
 
     Parameters
     ----------
     source, target : Features
         Of one kind. Distances are L2 for real and Hamming for binary (uint8) descriptors.
-    mutual : bool
-        Keep a pair only if each is the other's nearest.
     """
     if not len(source.positions) or not len(target.positions):
         return Associations(np.empty((0, 2)), np.empty((0, 2)))
     norm = cv2.NORM_HAMMING if source.descriptors.dtype == np.uint8 else cv2.NORM_L2
-    matches = cv2.BFMatcher(norm, crossCheck=mutual).match(source.descriptors, target.descriptors)
+    matches = cv2.BFMatcher(norm, crossCheck=True).match(source.descriptors, target.descriptors)
     pairs = np.array([(m.queryIdx, m.trainIdx) for m in matches], dtype=int).reshape(-1, 2)
     # A keypoint with two orientations stands twice in the features; it is one spot of ground.
     ends = np.hstack([source.positions[pairs[:, 0]], target.positions[pairs[:, 1]]])

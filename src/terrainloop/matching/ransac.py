@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from terrainloop.matching.correspondences import Associations
 from terrainloop.matching.ssd import Ssd, compute_ssd
 
 CHUNK = 2_000_000  # distances evaluated at a time, which bounds memory
+MAX_VERIFIED = 200  # inlier sets whose h is computed, which bounds the time of a pair
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,7 @@ def register_by_ransac(
     draws = draws[apart > inlier_radius]  # closer than their own error, two points tell no rotation
     T = fit_se2(associations.source[draws], associations.target[draws])
     best = None
-    for inliers in _distinct_by_falling_count(associations, T, inlier_radius):
+    for inliers in islice(_distinct_by_falling_count(associations, T, inlier_radius), MAX_VERIFIED):
         T_i = fit_se2(associations.source[inliers], associations.target[inliers])
         alignment = Alignment(T_i, inliers, compute_ssd(source, target, T_i))
         if alignment.ssd.ratio <= max_ssd_ratio:

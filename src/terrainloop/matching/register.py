@@ -55,7 +55,6 @@ def register(
     associations = associate(
         source_features or features_of(source_map, settings),
         target_features or features_of(target_map, settings),
-        mutual=settings.match.mutual,
     )
     alignment = align(source_map, target_map, associations, settings, names)
     if alignment is None:
@@ -74,7 +73,7 @@ def register(
         ssd=alignment.ssd.value,
         ssd_ratio=alignment.ssd.ratio,
         overlap=alignment.ssd.overlap,
-        score=float(inliers),
+        score=inliers * max(0.0, 1.0 - alignment.ssd.ratio),
         accepted=accepted,
         reason=reason,
     )
