@@ -85,6 +85,13 @@ def test_gradient_variance_equals_the_dense_formula(surface):
         assert field.gradient_variance[row, column] == pytest.approx(each.mean(), rel=1e-6)
 
 
+def test_far_from_all_points_the_prior_remains(surface):
+    field = predict_grid(*surface, PARAMETERS, np.array([40.0, 40.1]), np.array([40.0]))
+    assert field.elevation == pytest.approx(0.0, abs=1e-12)
+    assert field.variance == pytest.approx(PARAMETERS.variance)
+    assert field.gradient_variance == pytest.approx(PARAMETERS.variance / PARAMETERS.length_scale**2)
+
+
 def test_prediction_does_not_depend_on_workers(surface):
     x = np.linspace(0, 3, 70)
     one, two = (predict_grid(*surface, PARAMETERS, x, x, workers=workers) for workers in (1, 2))

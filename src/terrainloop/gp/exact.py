@@ -130,9 +130,12 @@ def _variances(
         nodes_y, weight_y, slope_y = _interpolation(y[tile[0]], side)
         nodes_x, weight_x, slope_x = _interpolation(x[tile[1]], side)
         near = _within_reach(xy, nodes_x, nodes_y, reach)
+        if len(near) == 0:
+            variance[tile], gradient_variance[tile] = parameters.variance, prior
+            return
         kx = factor(nodes_x, xy[near, 0], parameters.length_scale)[0]
         ky = factor(nodes_y, xy[near, 1], parameters.length_scale)[0]
-        k = parameters.variance * (ky[:, None, :] * kx[None, :, :]).reshape(-1, max(len(near), 1))
+        k = parameters.variance * (ky[:, None, :] * kx[None, :, :]).reshape(-1, len(near))
         local = precision if len(near) == len(xy) else precision[np.ix_(near, near)]
         explained = k @ local @ k.T
         variance[tile] = parameters.variance - _quadratic(explained, weight_y, weight_x)
