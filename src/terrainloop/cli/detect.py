@@ -90,6 +90,7 @@ def summarise(candidates: Sequence["LoopCandidate"], records: Sequence["SubmapRe
     return {
         "submaps": sum(record.status == "ok" for record in records),
         "broken": {record.name: record.notes for record in records if record.status == "broken"},
+        "repaired": {r.name: r.notes for r in records if r.status == "ok" and r.notes},
         "pairs": len(candidates),
         "loops": [
             {
@@ -140,6 +141,9 @@ def show(console: Console, detector: "LoopDetector", records: Sequence["SubmapRe
     for record in records:
         if record.status == "broken":
             console.print(f"  left out {record.name}: {record.notes}")
+    repaired = sum(record.status == "ok" and bool(record.notes) for record in records)
+    if repaired:
+        console.print(f"  {repaired} submaps were repaired on the way in: see notes in submaps.csv")
     console.print(
         f"Written to {output}: loops.csv, pairs.csv (why each was rejected), submaps.csv, config.yaml"
     )

@@ -1,5 +1,6 @@
 """A whole mission at once: maps in parallel processes, then every pair."""
 
+import logging
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
@@ -99,10 +100,14 @@ def _map_clouds(
         with threadpool_limits(1, user_api="blas"):
             yield from map(work, range(len(mission)))
         return
-    with ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=threadpool_limits, initargs=(1, "blas")
-    ) as pool:
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_start_worker) as pool:
         yield from pool.map(work, range(len(mission)))
+
+
+def _start_worker() -> None:
+    """One BLAS thread a process; what would be logged is in the records."""
+    threadpool_limits(1, user_api="blas")
+    logging.disable()
 
 
 def _map_cloud(
