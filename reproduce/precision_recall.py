@@ -57,7 +57,8 @@ def markdown(results):
             f"| {name} | {result['pairs']} ({result['true_pairs']}) | {' | '.join(cells)} "
             f"| {best['0.3-1'] or 0:.2f} | {best['0.1-0.3'] or 0:.2f} "
             f"| {result['accepted']} ({result['accepted_wrong_pose']}) "
-            f"| {result['median_position_error_m'] or 0:.2f} m, {result['median_yaw_error_deg'] or 0:.2f} deg |"
+            f"| {result['median_position_error_m'] or 0:.2f} m, "
+            f"{result['median_yaw_error_deg'] or 0:.2f} deg |"
         )
 
 
