@@ -1,0 +1,176 @@
+"""Settings: to YAML and back, errors that name file and key, and the paper's published numbers."""
+
+import numpy as np
+import pytest
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from terrainloop.config import MapSettings, MatchSettings, Settings
+from terrainloop.errors import TerrainLoopError
+
+PRESETS = ("default", "paper")
+
+
+def leaves(model, prefix=""):
+    """Dotted names and fields of all public numbers."""
+    for name, field in type(model).model_fields.items():
+        value = getattr(model, name)
+        if isinstance(value, BaseModel):
+            yield from leaves(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, field
+
+
+def refusal(path):
+    with pytest.raises(TerrainLoopError) as caught:
+        Settings.from_yaml(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(path) in message
+    assert "terrainloop config" in message  # how to mend it
+    return message
+
+
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "settings.yaml"
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_survive_yaml(preset, file):
+    settings = Settings.preset(preset)
+    file.write_text(settings.to_yaml(), encoding="utf-8")
+    assert Settings.from_yaml(file) == settings
+
+
+def test_changed_settings_survive_yaml(file):
+    settings = Settings(
+        map=MapSettings(length_scale=1e-5 + 0.25, noise=1e-7, fit="submap"),
+        match=MatchSettings(max_ssd_ratio=1 / 3, inlier_radius=12345.678),
+        skip_recent=0,
+        seed=2**40,
+    )
+    file.write_text(settings.to_yaml(), encoding="utf-8")
+    assert Settings.from_yaml(file) == settings
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_yaml_is_what_plain_yaml_reads(preset):
+    settings = Settings.preset(preset)
+    assert yaml.safe_load(settings.to_yaml()) == settings.model_dump(mode="json")
+
+
+def test_yaml_says_what_each_number_means():
+    text = Settings().to_yaml()
+    for name, field in leaves(Settings()):
+        assert field.description
+        line = next(line for line in text.splitlines() if line.strip().startswith(name.split(".")[-1] + ":"))
+        assert "# " in line
+
+
+def test_what_a_file_leaves_out_keeps_its_default(file):
+    file.write_text("match: {min_inliers: 17}\n")
+    settings = Settings.from_yaml(file)
+    assert settings.match.min_inliers == 17
+    assert settings == Settings(match=MatchSettings(min_inliers=17))
+
+
+@pytest.mark.parametrize("content", ["", "# nothing\n", "{}\n"])
+def test_an_empty_file_is_the_default(file, content):
+    file.write_text(content)
+    assert Settings.from_yaml(file) == Settings()
+
+
+@pytest.mark.parametrize(
+    ("content", "key"),
+    [
+        ("speed: 3", "speed"),
+        ("map: {max_pionts: 400}", "map.max_pionts"),
+        ("map: {max_points: many}", "map.max_points"),
+        ("map: {max_points: [1]}", "map.max_points"),
+        ("map: 5", "map"),
+        ("map: {max_points: 1}", "map.max_points"),
+        ("map: {length_scale: 0}", "map.length_scale"),
+        ("map: {length_scale: -0.3}", "map.length_scale"),
+        ("map: {length_scale: .nan}", "map.length_scale"),
+        ("map: {noise: [0.1]}", "map.noise"),
+        ("map: {fit: never}", "map.fit"),
+        ("map: {max_variance_ratio: 1.5}", "map.max_variance_ratio"),
+        ("features: {kind: shot}", "features.kind"),
+        ("match: {min_inliers: 1}", "match.min_inliers"),
+        ("match: {iterations: 2.5}", "match.iterations"),
+        ("skip_recent: -1", "skip_recent"),
+        ("seed: null", "seed"),
+        ("seed: -3", "seed"),
+        ("5: 6", "5"),
+    ],
+)
+def test_what_is_wrong_is_named(file, content, key):
+    file.write_text(content + "\n")
+    assert f"found {key}:" in refusal(file)
+
+
+@pytest.mark.xfail(reason="config.py accepts infinity (fields lack allow_inf_nan=False)", strict=True)
+def test_infinity_is_refused(file):
+    file.write_text("map: {length_scale: .inf}\n")
+    assert "map.length_scale" in refusal(file)
+
+
+@pytest.mark.parametrize("content", ["- 1\n- 2\n", "just words\n", "3.5\n"])
+def test_no_mapping_is_refused(file, content):
+    file.write_text(content)
+    refusal(file)
+
+
+@pytest.mark.parametrize("content", [b"map: {a: ", b"a: b: c\n", b"\xff\xfe\x00\x81" * 20, b"\x00\x01\x02"])
+def test_no_yaml_is_refused(file, content):
+    file.write_bytes(content)
+    refusal(file)
+
+
+def test_no_file_is_refused(tmp_path):
+    refusal(tmp_path / "absent.yaml")
+    refusal(tmp_path)
+
+
+def test_unknown_preset_is_refused():
+    with pytest.raises(TerrainLoopError, match=r"expected .*paper.*; found 'papers'"):
+        Settings.preset("papers")
+
+
+def test_paper_preset_is_the_published_pipeline():
+    paper = Settings.preset("paper")
+    assert paper.map.max_points == 5000
+    assert paper.map.resolution == 0.03
+    # The paper's kernel is exp(-d^2 / (2 l_k)) with l_k = 0.1: our length scale is its square root.
+    assert paper.map.length_scale == pytest.approx(np.sqrt(0.1), abs=5e-4)
+    assert paper.map.remove_plane is False
+    assert paper.map.fit == "submap"
+    assert paper.features.kind == "surf"
+    assert paper.match.min_inliers in (4, 5)
+
+
+def test_default_derives_its_lengths_from_the_data():
+    settings = Settings()
+    assert settings.map.length_scale is None
+    assert settings.map.resolution is None
+    assert settings.match.inlier_radius is None
+
+
+def test_few_numbers():
+    names = [name for name, _ in leaves(Settings())]
+    assert len(names) <= 15
+
+
+@pytest.mark.parametrize(("path", "name"), [("map", "max_points"), ("match", "iterations"), ("", "seed")])
+def test_settings_cannot_be_changed(path, name):
+    settings = Settings()
+    owner = getattr(settings, path) if path else settings
+    with pytest.raises(ValidationError):
+        setattr(owner, name, 77)
+    assert settings == Settings()
+
+
+def test_unknown_names_in_code_are_refused():
+    with pytest.raises(ValidationError):
+        Settings(sead=1)

@@ -1,0 +1,292 @@
+"""Gradient maps: where a pixel lies, what the contract promises, and files."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from terrainloop.errors import TerrainLoopError
+from terrainloop.gradient_map import GradientMap
+from terrainloop.submap import Submap
+
+UTM = np.array([5e5, 4e6, 0.0])
+ARRAYS = ("elevation", "gradient_x", "gradient_y", "magnitude", "variance", "gradient_variance")
+GIVEN = {"length_scale": 0.4, "variance": 0.01, "noise": 0.011}
+
+
+def scatter(count=500, width=4.0, height=3.0, seed=0):
+    """Positions (count, 2) whose bounding box begins at (1, -2)."""
+    xy = np.random.default_rng(seed).uniform(0, 1, (count, 2)) * [width, height]
+    return xy - xy.min(axis=0) + [1.0, -2.0]
+
+
+def grid_of(gradient_map):
+    """World position (rows, columns, 2) of every pixel, as the contract has it."""
+    rows, columns = np.indices(gradient_map.mask.shape)
+    return np.array(gradient_map.origin) + gradient_map.resolution * np.stack([columns, rows], axis=-1)
+
+
+def same_bytes(a, b):
+    return (
+        all(
+            np.asarray(getattr(a, f.name)).tobytes() == np.asarray(getattr(b, f.name)).tobytes()
+            for f in fields(GradientMap)
+            if f.name != "parameters"
+        )
+        and a.parameters == b.parameters
+    )
+
+
+@pytest.fixture(scope="module")
+def cloud(world):
+    xy = scatter()
+    return np.c_[xy, world(2).height(xy) + np.random.default_rng(1).normal(0, 0.01, len(xy))]
+
+
+@pytest.fixture(scope="module")
+def bumpy(cloud):
+    return GradientMap.from_points(cloud, **GIVEN, resolution=0.1)
+
+
+def test_pixels_cover_the_bounding_box_from_its_corner(cloud, bumpy):
+    low, high = cloud[:, :2].min(0), cloud[:, :2].max(0)
+    grid = grid_of(bumpy)
+    np.testing.assert_allclose(grid[0, 0], low, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(grid[0, 0], [1.0, -2.0], rtol=0, atol=1e-9)
+    assert (grid[-1, -1] <= high + 1e-9).all()
+    assert (grid[-1, -1] > high - 0.1).all()
+
+
+def test_arrays_keep_the_contract(bumpy):
+    columns, rows = 40, 30  # 4 x 3 m at 0.1 m, less than a pixel missing on each side
+    for name in ARRAYS:
+        image = getattr(bumpy, name)
+        assert image.dtype == np.float32, name
+        assert image.shape == bumpy.mask.shape, name
+        assert np.isfinite(image).all(), name
+    assert bumpy.mask.dtype == bool
+    assert bumpy.mask.shape == pytest.approx((rows, columns), abs=1)
+    assert bumpy.mask.shape[0] < bumpy.mask.shape[1]
+    assert bumpy.resolution == 0.1
+    assert len(bumpy.origin) == 2
+    length = np.sqrt(bumpy.gradient_x**2 + bumpy.gradient_y**2)
+    np.testing.assert_allclose(bumpy.magnitude, length, rtol=1e-6)
+
+
+def test_map_shows_the_ground_it_was_made_of(world, bumpy):
+    inner = np.s_[5:-5, 5:-5]
+    grid = grid_of(bumpy)[inner]
+    height = world(2).height(grid.reshape(-1, 2)).reshape(grid.shape[:2])
+    slope = world(2).slope(grid.reshape(-1, 2)).reshape(grid.shape)
+    assert np.sqrt(np.mean((bumpy.elevation[inner] - height) ** 2)) < 0.15 * height.std()
+    for estimate, truth in ((bumpy.gradient_x, slope[..., 0]), (bumpy.gradient_y, slope[..., 1])):
+        assert np.corrcoef(estimate[inner].ravel(), truth.ravel())[0, 1] > 0.95
+        assert np.sqrt(np.mean((estimate[inner] - truth) ** 2)) < 0.3 * truth.std()
+
+
+def test_variances_are_those_of_the_errors(world, bumpy):
+    """Normalised errors against the known ground average near one (the ground is no draw of the prior)."""
+    inner = np.s_[5:-5, 5:-5]
+    grid = grid_of(bumpy)[inner].reshape(-1, 2)
+    height = world(2).height(grid)
+    error = bumpy.elevation[inner].ravel() - height
+    assert 0.2 < np.mean(error**2 / bumpy.variance[inner].ravel()) < 5.0
+    slope = world(2).slope(grid)
+    squared = (bumpy.gradient_x[inner].ravel() - slope[:, 0]) ** 2
+    squared += (bumpy.gradient_y[inner].ravel() - slope[:, 1]) ** 2
+    assert 0.2 < np.mean(squared / 2 / bumpy.gradient_variance[inner].ravel()) < 5.0
+
+
+@pytest.mark.parametrize("offset", [np.zeros(3), UTM, -UTM], ids=["local", "utm", "negative utm"])
+@pytest.mark.parametrize("remove_plane", [True, False])
+def test_tilted_plane(offset, remove_plane):
+    xy = scatter()
+    a, b, c = 0.12, -0.07, 25.0
+    points = np.c_[xy, a * xy[:, 0] + b * xy[:, 1] + c] + offset
+    options = {"length_scale": 2.0, "variance": 0.5, "noise": 1e-3}
+    plane = GradientMap.from_points(points, **options, resolution=0.25, remove_plane=remove_plane)
+    grid = grid_of(plane) - offset[:2]
+    tolerance = 2e-6 if remove_plane else 2e-2
+    height = a * grid[..., 0] + b * grid[..., 1] + c
+    np.testing.assert_allclose(plane.elevation, height, rtol=0, atol=max(tolerance / 10, 4e-6))
+    np.testing.assert_allclose(plane.gradient_x, a, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(plane.gradient_y, b, rtol=0, atol=tolerance)
+
+
+def test_utm_coordinates_lose_nothing(cloud, bumpy):
+    far = GradientMap.from_points(cloud + UTM, **GIVEN, resolution=0.1)
+    for name in ARRAYS:
+        np.testing.assert_allclose(getattr(far, name), getattr(bumpy, name), rtol=0, atol=1e-5, err_msg=name)
+    assert (far.mask == bumpy.mask).mean() > 0.999
+    np.testing.assert_allclose(np.subtract(far.origin, UTM[:2]), bumpy.origin, rtol=0, atol=1e-6)
+
+
+def test_mask_is_false_in_a_hole_and_true_on_data(world):
+    xy = scatter(900)
+    centre = np.array([3.0, -0.5])
+    xy = xy[np.linalg.norm(xy - centre, axis=1) > 1.0]
+    holed = GradientMap.from_points(np.c_[xy, world(2).height(xy)], **GIVEN, resolution=0.1)
+    from_centre = np.linalg.norm(grid_of(holed) - centre, axis=-1)
+    assert not holed.mask[from_centre < 0.4].any()
+    assert holed.mask[from_centre > 1.0].mean() > 0.98
+    known = holed.variance < 0.25 * GIVEN["variance"]
+    np.testing.assert_array_equal(holed.mask, known)
+
+
+def test_mask_follows_its_threshold(cloud):
+    shares = [
+        GradientMap.from_points(cloud, **GIVEN, resolution=0.2, max_variance_ratio=ratio).mask.mean()
+        for ratio in (0.005, 0.02, 0.9)
+    ]
+    assert shares[0] < shares[1] < shares[2] == 1.0
+
+
+@pytest.mark.parametrize("name", GIVEN)
+def test_given_hyperparameters_are_kept_and_the_others_fitted(cloud, name):
+    gradient_map = GradientMap.from_points(cloud, **{name: GIVEN[name]}, resolution=0.3)
+    for other, start in GIVEN.items():
+        value = getattr(gradient_map.parameters, other)
+        if other == name:
+            assert value == pytest.approx(start, rel=1e-12)
+        else:
+            assert 0 < value < np.inf
+    assert gradient_map.parameters.noise == pytest.approx(0.01, rel=0.35)  # what the cloud was made with
+
+
+def test_all_given_are_kept_exactly(bumpy):
+    assert vars(bumpy.parameters) == GIVEN
+
+
+def test_resolution_follows_the_length_scale(cloud):
+    fine, coarse = (GradientMap.from_points(cloud, length_scale, 0.01, 0.011) for length_scale in (0.6, 1.2))
+    assert coarse.resolution == pytest.approx(2 * fine.resolution)
+    assert 0.02 < fine.resolution < 0.6
+
+
+def test_too_many_points_are_thinned_by_the_seed(cloud):
+    options = {**GIVEN, "resolution": 0.3, "max_points": 200}
+    one, again, other = (GradientMap.from_points(cloud, **options, seed=seed) for seed in (3, 3, 4))
+    assert same_bytes(one, again)
+    assert not np.array_equal(one.elevation, other.elevation)
+    whole = GradientMap.from_points(cloud, **GIVEN, resolution=0.3)
+    assert np.median(one.variance) > 1.2 * np.median(whole.variance)  # fewer points know less
+
+
+def test_few_enough_points_are_all_kept(cloud):
+    one, other = (
+        GradientMap.from_points(cloud, **GIVEN, resolution=0.3, max_points=len(cloud), seed=seed)
+        for seed in (3, 4)
+    )
+    assert same_bytes(one, other)
+
+
+@pytest.mark.parametrize("given", [GIVEN, {}], ids=["given", "fitted"])
+def test_workers_do_not_change_a_byte(cloud, given):
+    one, three = (GradientMap.from_points(cloud, **given, resolution=0.1, workers=w) for w in (1, 3))
+    assert same_bytes(one, three)
+
+
+def test_submap_and_its_points_make_the_same_map(cloud, bumpy):
+    assert same_bytes(GradientMap.from_points(Submap(cloud, "a"), **GIVEN, resolution=0.1), bumpy)
+    assert same_bytes(GradientMap.from_points(cloud.tolist(), **GIVEN, resolution=0.1), bumpy)
+
+
+def test_absurd_grid_is_an_error(cloud):
+    with pytest.raises(TerrainLoopError, match=r"pixels.*coarser"):
+        GradientMap.from_points(cloud, **GIVEN, resolution=1e-5)
+
+
+def test_pixel_larger_than_the_cloud_is_one_pixel(cloud):
+    assert GradientMap.from_points(cloud, **GIVEN, resolution=50.0).mask.shape == (1, 1)
+
+
+@pytest.mark.parametrize("points", [np.zeros((5, 3)), np.zeros((200, 2)), "words", np.full((300, 3), np.nan)])
+def test_no_submap_is_an_error(points):
+    with pytest.raises(TerrainLoopError):
+        GradientMap.from_points(points)
+
+
+@pytest.mark.xfail(reason="gradient_map.py passes impossible numbers on to NumPy", strict=True)
+@pytest.mark.parametrize(
+    "impossible",
+    [
+        {"resolution": -0.1},
+        {"resolution": 0.0},
+        {"length_scale": 0.0},
+        {"length_scale": -0.4},
+        {"noise": -0.1},
+    ],
+)
+def test_impossible_numbers_are_an_error(cloud, impossible):
+    with pytest.raises(TerrainLoopError):
+        GradientMap.from_points(cloud, **{**GIVEN, "resolution": 0.3, **impossible})
+
+
+def test_map_survives_its_file(tmp_path, bumpy):
+    bumpy.save(tmp_path / "map.npz")
+    again = GradientMap.load(str(tmp_path / "map.npz"))
+    assert same_bytes(again, bumpy)
+    assert type(again.origin) is tuple
+    assert type(again.resolution) is float
+    assert again.mask.dtype == bool
+
+
+def test_file_is_the_same_each_time_and_read_by_plain_numpy(tmp_path, bumpy):
+    bumpy.save(tmp_path / "a.npz")
+    bumpy.save(tmp_path / "b.npz")
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as file:
+        np.testing.assert_array_equal(file["magnitude"], bumpy.magnitude)
+        assert {*ARRAYS, "mask", "origin", "resolution"} <= set(file)
+
+
+def other_archive(path):
+    np.savez(path, points=np.zeros((10, 3)))
+
+
+def words(path):
+    path.write_text("no map")
+
+
+def nothing(path):
+    path.write_bytes(b"")
+
+
+def half_a_map(path):
+    half = path.read_bytes()
+    path.write_bytes(half[: len(half) // 2])
+
+
+def plain_array(path):
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+
+
+def no_file(path):
+    path.unlink()
+
+
+# Not run: NumPy leaks the file it was given by name, and that warning ends the whole session.
+BAD_ZIP = pytest.mark.xfail(reason="GradientMap.load lets BadZipFile through, and leaks the file", run=False)
+NO_ZIP = pytest.mark.xfail(reason="GradientMap.load lets the TypeError of a plain .npy through", strict=True)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        other_archive,
+        words,
+        nothing,
+        no_file,
+        pytest.param(half_a_map, marks=BAD_ZIP),
+        pytest.param(plain_array, marks=NO_ZIP),
+    ],
+)
+def test_what_is_no_map_is_an_error(tmp_path, bumpy, spoil):
+    path = tmp_path / "map.npz"
+    bumpy.save(path)
+    spoil(path)
+    with pytest.raises(TerrainLoopError) as caught:
+        GradientMap.load(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
