@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +58,7 @@ class GradientMap:
     resolution: float
     parameters: Hyperparameters
 
-    @property
+    @cached_property
     def magnitude(self) -> Image:
         """Length of the gradient (I_g of the paper), dimensionless."""
         return np.hypot(self.gradient_x, self.gradient_y)
