@@ -563,6 +563,11 @@ def test_utm_covariance_is_the_local_one_carried_along(maps, strict):
     jacobian = np.array([(carried(here + d) - carried(here - d)) / 2e-6 for d in step]).T
     expected = jacobian @ loop.covariance @ jacobian.T
     np.testing.assert_allclose(np.diag(far.covariance), np.diag(expected), rtol=0.3)
+
+    def correlation(covariance):
+        return covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+
+    np.testing.assert_allclose(correlation(far.covariance), correlation(expected), rtol=0, atol=0.1)
     error = parameters_of(far.T_target_source) - carried(parameters_of(PLACES[name].T))
     assert (np.abs(error) < 5 * np.sqrt(np.diag(far.covariance))).all()
 
