@@ -66,13 +66,17 @@ def register_by_ransac(
     apart = np.linalg.norm(associations.source[draws[:, 0]] - associations.source[draws[:, 1]], axis=1)
     draws = draws[apart > inlier_radius]  # closer than their own error, two points tell no rotation
     T = fit_se2(associations.source[draws], associations.target[draws])
+    # Samples half a length scale apart hold what neighbouring pixels repeat: enough to discard by.
+    step = max(1, int(target.parameters.length_scale / 2 / target.resolution))
     best = None
     for inliers in islice(_distinct_by_falling_count(associations, T, inlier_radius), MAX_VERIFIED):
         T_i = fit_se2(associations.source[inliers], associations.target[inliers])
-        alignment = Alignment(T_i, inliers, compute_ssd(source, target, T_i))
-        if alignment.ssd.ratio <= max_ssd_ratio:
-            return alignment
-        best = best or alignment
+        hopeful = compute_ssd(source, target, T_i, step).ratio <= max_ssd_ratio
+        if hopeful or best is None:
+            alignment = Alignment(T_i, inliers, compute_ssd(source, target, T_i))
+            if alignment.ssd.ratio <= max_ssd_ratio:
+                return alignment
+            best = best or alignment
     return best
 
 

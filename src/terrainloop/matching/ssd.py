@@ -30,7 +30,7 @@ class Ssd:
     overlap: float
 
 
-def compute_ssd(source: GradientMap, target: GradientMap, T_target_source: Array) -> Ssd:
+def compute_ssd(source: GradientMap, target: GradientMap, T_target_source: Array, step: int = 1) -> Ssd:
     """*ComputeSSDMetric* of Algorithm 1, on the pixels of the target.
 
     Parameters
@@ -39,17 +39,21 @@ def compute_ssd(source: GradientMap, target: GradientMap, T_target_source: Array
         The query q and the stored map d.
     T_target_source : array, (3, 3)
         SE(2) transform that takes source coordinates to the target's.
+    step : int
+        Look at every step-th row and column of the target only.
     """
-    both = warp(source.mask.astype(np.float32), source, target, T_target_source) > 0.999
-    both &= target.mask
-    source_area = source.mask.sum() * (source.resolution / target.resolution) ** 2
+    known = warp(source.mask.astype(np.float32), source, target, T_target_source, step) > 0.999
+    both = known & target.mask[::step, ::step]
     shared = int(both.sum())
-    overlap = shared / max(source_area + target.mask.sum() - shared, 1)
     if shared == 0:
         return Ssd(value=0.0, ratio=np.inf, overlap=0.0)
-    g_q = warp(source.magnitude, source, target, T_target_source)[both].astype(float)
-    v_q = warp(source.variance, source, target, T_target_source)[both].astype(float)
-    g_d, v_d = target.magnitude[both].astype(float), target.variance[both].astype(float)
+    source_area = source.mask.sum() * source.resolution**2
+    shared_area = shared * (step * target.resolution) ** 2
+    overlap = shared_area / (source_area + target.mask.sum() * target.resolution**2 - shared_area)
+    g_q = warp(source.magnitude, source, target, T_target_source, step)[both].astype(float)
+    v_q = warp(source.variance, source, target, T_target_source, step)[both].astype(float)
+    g_d = target.magnitude[::step, ::step][both].astype(float)
+    v_d = target.variance[::step, ::step][both].astype(float)
     weights = 1.0 / (v_q * v_d)
     value = float(weights @ (g_q - g_d) ** 2)
     unrelated = float(weights @ (_centred(g_q, weights) ** 2 + _centred(g_d, weights) ** 2))
@@ -57,14 +61,18 @@ def compute_ssd(source: GradientMap, target: GradientMap, T_target_source: Array
 
 
 def warp(
-    image: NDArray[np.float32], source: GradientMap, target: GradientMap, T_target_source: Array
+    image: NDArray[np.float32],
+    source: GradientMap,
+    target: GradientMap,
+    T_target_source: Array,
+    step: int = 1,
 ) -> NDArray[np.float32]:
-    """Resample an image of the source map on the pixels of the target map, 0 where it has none."""
-    pixels_of_target = _metres_from_pixels(target)
+    """Resample an image of the source map on every step-th pixel of the target, 0 where it has none."""
+    pixels_of_target = _metres_from_pixels(target) @ np.diag([step, step, 1.0])
     lookup = np.linalg.inv(_metres_from_pixels(source)) @ inverse(T_target_source) @ pixels_of_target
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    size = (target.mask.shape[1], target.mask.shape[0])
-    return cv2.warpAffine(image, lookup[:2], size, flags=flags, borderValue=0.0).astype(
+    rows, columns = target.mask[::step, ::step].shape
+    return cv2.warpAffine(image, lookup[:2], (columns, rows), flags=flags, borderValue=0.0).astype(
         np.float32, copy=False
     )
 
