@@ -110,7 +110,6 @@ def test_what_is_wrong_is_named(file, content, key):
     assert f"found {key}:" in refusal(file)
 
 
-@pytest.mark.xfail(reason="config.py accepts infinity (fields lack allow_inf_nan=False)", strict=True)
 def test_infinity_is_refused(file):
     file.write_text("map: {length_scale: .inf}\n")
     assert "map.length_scale" in refusal(file)

@@ -66,7 +66,6 @@ def test_bands_are_named(file, bands):
         assert tiff.pages[0].tags["SamplesPerPixel"].value == len(bands)
 
 
-@pytest.mark.xfail(reason="write_geotiff asks for separate planes of one band", strict=True)
 def test_one_band(tmp_path, bands):
     write_geotiff(str(tmp_path / "one.tif"), {"number": bands["number"]}, ORIGIN, RESOLUTION)
     np.testing.assert_array_equal(np.squeeze(tifffile.imread(tmp_path / "one.tif")), bands["number"][::-1])

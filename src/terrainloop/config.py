@@ -10,7 +10,7 @@ from terrainloop.errors import TerrainLoopError
 
 
 class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class MapSettings(_Frozen):

@@ -1,6 +1,9 @@
 """The gradient map: elevation, gradient and uncertainty of a submap, sampled as images."""
 
 import io
+import zipfile
+import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +22,7 @@ Image = NDArray[np.float32]
 
 PIXELS_PER_LENGTH_SCALE = 6  # keeps the field's interpolation error below its noise
 MAX_PIXELS = 20_000_000
+_BAD_ZIP = (zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,12 +111,14 @@ class GradientMap:
         """
         surface = surface_of(points, max_points=max_points, remove_plane=remove_plane, seed=seed)
         given = {"length_scale": length_scale, "variance": variance, "noise": noise}
+        _check_positive(given | {"resolution": resolution})
         fixed = [name for name, value in given.items() if value is not None]
         parameters = surface.start(**given)
         if len(fixed) < len(given):
             blocks = surface.blocks(BLOCK_POINTS)
             parameters = maximise_likelihood(blocks, parameters, fixed=fixed, workers=workers)
-        resolution = resolution or parameters.length_scale / PIXELS_PER_LENGTH_SCALE
+        if resolution is None:
+            resolution = parameters.length_scale / PIXELS_PER_LENGTH_SCALE
         x, y = _axes(surface.xy, resolution)
         field = predict_grid(surface.xy, surface.elevation, parameters, x, y, workers=workers)
         plane = surface.centre[2] + surface.slope[0] * x + surface.slope[1] * y[:, None]
@@ -146,13 +152,13 @@ class GradientMap:
             If the file is no such map.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with np.load(io.BytesIO(Path(path).read_bytes()), allow_pickle=False) as file:
                 content = {field.name: file[field.name] for field in fields(cls)}
             content["origin"] = tuple(content["origin"].tolist())
             content["resolution"] = float(content["resolution"])
             content["parameters"] = Hyperparameters(*content["parameters"].tolist())
             return cls(**content)
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, LookupError, EOFError, TypeError, AttributeError, *_BAD_ZIP) as error:
             raise TerrainLoopError(
                 expected=f"a gradient map in {path}",
                 found=" ".join(str(error).split()),
@@ -172,6 +178,14 @@ def _axes(xy: NDArray[np.float64], resolution: float) -> tuple[NDArray[np.float6
             mend="remove far outlier points, or make the resolution coarser",
         )
     return low[0] + resolution * np.arange(width), low[1] + resolution * np.arange(height)
+
+
+def _check_positive(numbers: Mapping[str, float | None]) -> None:
+    for name, value in numbers.items():
+        if value is not None and not 0 < value < np.inf:
+            raise TerrainLoopError(
+                expected=f"a positive {name}", found=f"{value}", mend="leave it out to have it derived"
+            )
 
 
 def _values(parameters: Hyperparameters) -> list[float]:

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 from terrainloop.cli import detect, match
-from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose, WorkersOption, output_folder
+from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose, WorkersOption
 
 if TYPE_CHECKING:
     from terrainloop.detection.detector import LoopDetector
@@ -22,7 +22,7 @@ def command(
     ),
     world: Annotated[str, typer.Option("--world", help="etna, morocco, mars or flat.")] = "etna",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed, another place.")] = 0,
-    submaps: Annotated[int, typer.Option("--submaps", help="How many; 16 have loops.")] = 16,
+    submaps: Annotated[int, typer.Option("--submaps", min=3, help="How many; 16 have loops.")] = 16,
     workers: WorkersOption = 0,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -35,7 +35,8 @@ def command(
     from terrainloop.simulation.missions import simulate_mission, write_mission
 
     terminal = Terminal.open(as_json, quiet, verbose)
-    folder = output_folder(output) / "mission"
+    folder = output / "mission"
+    folder.mkdir(parents=True, exist_ok=True)
     with terminal.progress() as progress:
         simulated = simulate_mission(
             world, seed, submaps, progress=lambda done, total: progress("simulated", done, total)

@@ -18,7 +18,7 @@ from terrainloop.cli.terminal import (
     Terminal,
     Verbose,
     WorkersOption,
-    output_folder,
+    count_of,
     read_settings,
     table_of,
     worker_count,
@@ -71,7 +71,7 @@ def run_detection(
     from terrainloop.detection.mission import detect_mission
     from terrainloop.io.results import write_loops, write_submaps
 
-    output_folder(output)
+    output.mkdir(parents=True, exist_ok=True)
     with terminal.progress() as progress:
         detector, records = detect_mission(
             mission, settings, workers=worker_count(workers), on_progress=progress
@@ -133,17 +133,18 @@ def show(console: Console, detector: "LoopDetector", records: Sequence["SubmapRe
     console.print(table_of("Loop closures", columns, [_row(loop) for loop in loops]))
     usable = sum(record.status == "ok" for record in records)
     console.print(
-        f"\n{len(loops)} loop closures in {len(detector.candidates)} pairs of {usable} submaps. "
+        f"\n{count_of(len(loops), 'loop closure')} in {count_of(len(detector.candidates), 'pair')} "
+        f"of {count_of(usable, 'submap')}. "
         "The transform takes points of source into the frame of target."
     )
     for count, kind in rejections(detector.candidates):
-        console.print(f"  {count} pairs rejected: {kind}")
+        console.print(f"  {count_of(count, 'pair')} rejected: {kind}")
     for record in records:
         if record.status == "broken":
             console.print(f"  left out {record.name}: {record.notes}")
     repaired = sum(record.status == "ok" and bool(record.notes) for record in records)
     if repaired:
-        console.print(f"  {repaired} submaps were repaired on the way in: see notes in submaps.csv")
+        console.print(f"  {count_of(repaired, 'submap')} repaired on the way in: see notes in submaps.csv")
     console.print(
         f"Written to {output}: loops.csv, pairs.csv (why each was rejected), submaps.csv, config.yaml"
     )

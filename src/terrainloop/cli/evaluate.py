@@ -44,6 +44,7 @@ def command(
     Consecutive submaps are left out: odometry joins them anyway. Detect with --all-pairs to score
     every other pair.
     """
+    from terrainloop.config import Settings
     from terrainloop.evaluation.judge import judge
     from terrainloop.evaluation.precision_recall import precision_recall
     from terrainloop.io.results import read_loops, read_submaps
@@ -57,8 +58,10 @@ def command(
         read_trajectory(truth).poses,
         _read_sessions(sessions) if sessions else None,
     )
+    acceptable = Settings.from_yaml(run / "config.yaml").match.max_ssd_ratio
     points = precision_recall(
-        [pair.candidate.inliers for pair in pairs],
+        # Algorithm 1 returns the inliers of an acceptable transform only.
+        [pair.candidate.inliers if pair.candidate.ssd_ratio <= acceptable else 0 for pair in pairs],
         [pair.overlap > min_overlap for pair in pairs],
         INLIER_THRESHOLDS,
     )

@@ -85,20 +85,11 @@ def command(
 
 
 def _write(gradient_map: "GradientMap", output: Path) -> None:
-    try:
-        if output.suffix.lower() == ".npz":
-            gradient_map.save(output)
-        else:
-            from terrainloop.io.rasters import write_geotiff
+    if output.suffix.lower() == ".npz":
+        gradient_map.save(output)
+        return
+    from terrainloop.io.rasters import write_geotiff
 
-            bands = ("elevation", "gradient_x", "gradient_y", "magnitude", "variance", "gradient_variance")
-            write_geotiff(
-                output,
-                {name: getattr(gradient_map, name) for name in bands},
-                gradient_map.origin,
-                gradient_map.resolution,
-            )
-    except OSError as error:
-        raise TerrainLoopError(
-            expected=f"to write {output}", found=str(error), mend="choose another -o"
-        ) from error
+    bands = ("elevation", "gradient_x", "gradient_y", "magnitude", "variance", "gradient_variance")
+    images = {name: getattr(gradient_map, name) for name in bands}
+    write_geotiff(output, images, gradient_map.origin, gradient_map.resolution)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose, output_folder
+from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose
 
 
 def command(
@@ -22,7 +22,7 @@ def command(
     from terrainloop.simulation.missions import simulate_mission, write_mission
 
     terminal = Terminal.open(as_json, quiet, verbose)
-    output_folder(output)
+    output.mkdir(parents=True, exist_ok=True)
     with terminal.progress() as progress:
         mission = simulate_mission(
             world, seed, submaps, sensor, progress=lambda done, total: progress("submaps", done, total)

@@ -116,12 +116,6 @@ def worker_count(workers: int) -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def output_folder(path: Path) -> Path:
-    """The folder, made if it is not there."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TerrainLoopError(
-            expected=f"a folder to write at {path}", found=str(error), mend="choose another -o"
-        ) from error
-    return path
+def count_of(number: int, noun: str) -> str:
+    """Number and noun, the noun in the plural where it must be."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

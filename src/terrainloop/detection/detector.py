@@ -82,24 +82,31 @@ class LoopDetector:
         TerrainLoopError
             If the name is taken or no map can be made; the database is then as it was.
         """
-        if self.parameters is None and self.settings.map.fit == "database":
-            self.parameters = fit_database([submap], self.settings)
-        return self.add_mapped(map_submap(submap, self.settings, self.parameters, workers=self.workers))
+        self._check_name(submap.name)
+        parameters = self.parameters
+        if parameters is None and self.settings.map.fit == "database":
+            parameters = fit_database([submap], self.settings)
+        query = map_submap(submap, self.settings, parameters, workers=self.workers)
+        self.parameters = parameters
+        return self.add_mapped(query)
 
     def add_mapped(self, query: MappedSubmap) -> list[LoopCandidate]:
         """As `add`, for a submap that is mapped already (see `map_submap`)."""
-        if query.name in self.submaps:
-            raise TerrainLoopError(
-                expected="a submap with a name of its own",
-                found=f"a second {query.name!r}",
-                mend="name each submap differently",
-            )
+        self._check_name(query.name)
         stored = list(self.submaps.values())[: max(0, len(self.submaps) - self.settings.skip_recent)]
         with ThreadPoolExecutor(self.workers) as pool:
             candidates = list(pool.map(partial(self._compare, query), stored))
         self.submaps[query.name] = query
         self.candidates += candidates
         return [candidate for candidate in candidates if candidate]
+
+    def _check_name(self, name: str) -> None:
+        if name in self.submaps:
+            raise TerrainLoopError(
+                expected="a submap with a name of its own",
+                found=f"a second {name!r}",
+                mend="name each submap differently",
+            )
 
     def _compare(self, query: MappedSubmap, stored: MappedSubmap) -> LoopCandidate:
         return register(

@@ -36,7 +36,7 @@ def write_geotiff(
         path,
         stack,
         photometric="minisblack",
-        planarconfig="separate",
+        planarconfig="separate" if len(stack) > 1 else None,
         compression="zlib",
         description=", ".join(bands),
         metadata=None,

@@ -100,4 +100,5 @@ def _at_source_origin(covariance_planar: Array, covariance_plane: Array, arm: Ar
     jacobian[:3, 3:] = [[0, -arm[2], arm[1]], [arm[2], 0, -arm[0]], [-arm[1], arm[0], 0]]
     c, s = np.cos(yaw), np.sin(yaw)
     jacobian[3:5, 3:5] = [[c, s], [-s, c]]
-    return jacobian @ covariance @ jacobian.T
+    moved = jacobian @ covariance @ jacobian.T
+    return (moved + moved.T) / 2  # rounding breaks the symmetry

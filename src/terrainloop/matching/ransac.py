@@ -39,7 +39,8 @@ def register_by_ransac(
 
     The loop of the paper keeps, over all draws, the transform with the most inliers among those
     whose SSD is acceptable. Here draws are visited by falling inlier count, so that the first
-    acceptable one is that transform and h need not be computed for the rest.
+    acceptable one is that transform and h need not be computed for the rest. To bound the time of a
+    pair, h is computed for at most `MAX_VERIFIED` inlier sets, the largest.
 
     Parameters
     ----------

@@ -53,12 +53,12 @@ def register(
     """
     settings = settings or Settings()
     associations = associate(
-        source_features or features_of(source_map, settings),
-        target_features or features_of(target_map, settings),
+        features_of(source_map, settings) if source_features is None else source_features,
+        features_of(target_map, settings) if target_features is None else target_features,
     )
     alignment = align(source_map, target_map, associations, settings, names)
     if alignment is None:
-        return _rejected(names, f"no two of {len(associations)} associations agree on a transform")
+        return _rejected(names, f"no transform: no two of {len(associations)} associations agree on one")
     matched = transform(alignment.T_target_source, associations.source[alignment.inliers])
     residuals = matched - associations.target[alignment.inliers]
     T, covariance = lift_to_se3(source_map, target_map, alignment.T_target_source, matched, residuals)

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch
 from numpy.typing import NDArray
 
+from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.precision_recall import OperatingPoint
 from terrainloop.geometry import Array, transform
 from terrainloop.gradient_map import GradientMap
@@ -34,8 +35,7 @@ def figure_map(submap: Submap, gradient_map: GradientMap) -> Figure:
     dots = first.scatter(drawn[:, 0], drawn[:, 1], c=drawn[:, 2], s=0.3, cmap="gist_earth", linewidths=0)
     _finish(first, "(a) point cloud, height")
     figure.colorbar(dots, ax=first, label="m")
-    slope = np.abs(gradient_map.magnitude[gradient_map.mask])
-    steep = float(np.percentile(slope, 99)) if slope.size else 1.0
+    steep = _steepest(gradient_map)
     panels: list[tuple[str, NDArray[np.float32], str, str, dict[str, Any]]] = [
         ("(b) elevation", gradient_map.elevation, "gist_earth", "m", {}),
         ("(c) standard deviation", np.sqrt(gradient_map.variance), "inferno", "m", {}),
@@ -142,7 +142,15 @@ def figure_precision_recall(points: Sequence[OperatingPoint], title: str) -> Fig
 
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a PNG; the same figure gives the same bytes."""
+    if path.suffix.lower() != ".png":
+        raise TerrainLoopError(expected="a picture that ends in .png", found=str(path), mend="rename it")
     figure.savefig(path, dpi=110, metadata={"Software": None})
+
+
+def _steepest(gradient_map: GradientMap) -> float:
+    """Slope that is drawn as full contrast."""
+    known = gradient_map.magnitude[gradient_map.mask]
+    return (float(np.percentile(known, 99)) if known.size else 0.0) or 1.0
 
 
 def _extent(gradient_map: GradientMap) -> tuple[float, float, float, float]:
@@ -158,8 +166,7 @@ def _veil(axes: Axes, gradient_map: GradientMap) -> None:
 
 
 def _show_magnitude(axes: Axes, gradient_map: GradientMap) -> None:
-    known = gradient_map.magnitude[gradient_map.mask]
-    steep = float(np.percentile(known, 99)) if known.size else 1.0
+    steep = _steepest(gradient_map)
     axes.imshow(
         gradient_map.magnitude, origin="lower", extent=_extent(gradient_map), cmap="gray", vmin=0, vmax=steep
     )
@@ -190,7 +197,7 @@ def _overlay(axes: Axes, source_map: GradientMap, target_map: GradientMap, T_tar
     moved = warp(source_map.magnitude, source_map, target_map, _planar(T_target_source))
     known = warp(source_map.mask.astype(np.float32), source_map, target_map, _planar(T_target_source)) > 0.999
     both = known & target_map.mask
-    steep = float(np.percentile(target_map.magnitude[target_map.mask], 99)) if target_map.mask.any() else 1.0
+    steep = _steepest(target_map)
     image = np.ones((*both.shape, 3))
     image[both, 0] = np.clip(moved / steep, 0, 1)[both]
     image[both, 1] = image[both, 2] = np.clip(target_map.magnitude / steep, 0, 1)[both]
