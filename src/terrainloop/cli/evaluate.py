@@ -59,18 +59,17 @@ def command(
         _read_sessions(sessions) if sessions else None,
     )
     acceptable = Settings.from_yaml(run / "config.yaml").match.max_ssd_ratio
-    points = precision_recall(
-        # Algorithm 1 returns the inliers of an acceptable transform only.
-        [pair.candidate.inliers if pair.candidate.ssd_ratio <= acceptable else 0 for pair in pairs],
-        [pair.overlap > min_overlap for pair in pairs],
-        INLIER_THRESHOLDS,
-    )
+    # Algorithm 1 returns the inliers of an acceptable transform only.
+    inliers = [pair.candidate.inliers if pair.candidate.ssd_ratio <= acceptable else 0 for pair in pairs]
+    points = precision_recall(inliers, [pair.overlap > min_overlap for pair in pairs], INLIER_THRESHOLDS)
+    by_pose = precision_recall(inliers, [pair.pose_is_right for pair in pairs], INLIER_THRESHOLDS)
+    rows = [_row(point, posed.precision) for point, posed in zip(points, by_pose, strict=True)]
     save_figure(
         figure_precision_recall(points, f"true match: IoU > {min_overlap:g}"), run / "precision_recall.png"
     )
-    _write_points(run / "precision_recall.csv", points)
-    summary = summarise(pairs, min_overlap) | {"precision_recall": [_row(point) for point in points]}
-    terminal.result(summary, lambda console: show(console, summary, points))
+    _write_rows(run / "precision_recall.csv", rows)
+    summary = summarise(pairs, min_overlap) | {"precision_recall": rows}
+    terminal.result(summary, lambda console: show(console, summary))
 
 
 def summarise(pairs: Sequence["JudgedPair"], min_overlap: float) -> dict[str, Any]:
@@ -104,22 +103,23 @@ def summarise(pairs: Sequence["JudgedPair"], min_overlap: float) -> dict[str, An
     }
 
 
-def show(console: Console, summary: dict[str, Any], points: Sequence["OperatingPoint"]) -> None:
+def show(console: Console, summary: dict[str, Any]) -> None:
     """The summary and the curve, as text."""
     rows = [
         [
-            f"{point.threshold:g}",
-            f"{point.precision:.3f}",
-            f"{point.recall:.3f}",
-            str(point.true_positives),
-            str(point.false_positives),
-            str(point.false_negatives),
-            "",
+            str(row["min_inliers"]),
+            f"{row['precision']:.3f}",
+            f"{row['recall']:.3f}",
+            str(row["true_positives"]),
+            str(row["false_positives"]),
+            str(row["false_negatives"]),
+            f"{row['pose_precision']:.3f}",
         ]
-        for point in points
+        for row in summary["precision_recall"]
     ]
     title = f"True match: bounding-box IoU > {summary['min_overlap']:g}"
-    console.print(table_of(title, ["n >=", "precision", "recall", "TP", "FP", "FN", ""], rows))
+    heads = ["n >=", "precision", "recall", "TP", "FP", "FN", "share with the right pose"]
+    console.print(table_of(title, heads, rows))
     console.print(
         f"\n{summary['pairs']} pairs scored, {summary['true_pairs']} of them true. "
         f"Accepted: {summary['accepted_true']} true, {summary['accepted_less_overlap']} that share less, "
@@ -139,7 +139,7 @@ def show(console: Console, summary: dict[str, Any], points: Sequence["OperatingP
             )
 
 
-def _row(point: "OperatingPoint") -> dict[str, float]:
+def _row(point: "OperatingPoint", pose_precision: float) -> dict[str, float]:
     return {
         "min_inliers": int(point.threshold),
         "precision": point.precision,
@@ -147,14 +147,15 @@ def _row(point: "OperatingPoint") -> dict[str, float]:
         "true_positives": point.true_positives,
         "false_positives": point.false_positives,
         "false_negatives": point.false_negatives,
+        "pose_precision": pose_precision,
     }
 
 
-def _write_points(path: Path, points: Sequence["OperatingPoint"]) -> None:
+def _write_rows(path: Path, rows: Sequence[dict[str, float]]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(_row(points[0])))
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
-        writer.writerows(_row(point) for point in points)
+        writer.writerows(rows)
 
 
 def _read_sessions(path: Path) -> dict[str, str]:

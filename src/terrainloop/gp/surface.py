@@ -8,6 +8,11 @@ from numpy.typing import ArrayLike
 from terrainloop.gp.kernel import Array, Hyperparameters
 from terrainloop.submap import Submap
 
+# Points further from the plane than this many robust standard deviations are no terrain: flying pixels,
+# masts, people. Single rocks on flat ground stay.
+NO_TERRAIN = 10.0
+PLANE_FITS = 3
+
 
 @dataclass(frozen=True, eq=False)
 class Surface:
@@ -69,9 +74,13 @@ def surface_of(points: ArrayLike | Submap, *, max_points: int, remove_plane: boo
     if len(cloud) > max_points:
         rng = np.random.default_rng(seed)
         cloud = cloud[np.sort(rng.choice(len(cloud), max_points, replace=False))]
-    centre = cloud.mean(axis=0)
-    local = cloud - centre
-    slope = np.zeros(2)
-    if remove_plane:
+    centre, slope = cloud.mean(axis=0), np.zeros(2)
+    for _ in range(PLANE_FITS if remove_plane else 0):
+        local = cloud - centre
         slope = np.linalg.lstsq(local[:, :2], local[:, 2], rcond=None)[0]
+        residual = local[:, 2] - local[:, :2] @ slope
+        spread = 1.4826 * np.median(np.abs(residual - np.median(residual)))
+        cloud = cloud[np.abs(residual - np.median(residual)) <= max(NO_TERRAIN * spread, 1e-3)]
+        centre = cloud.mean(axis=0)
+    local = cloud - centre
     return Surface(local[:, :2].copy(), local[:, 2] - local[:, :2] @ slope, centre, slope)
