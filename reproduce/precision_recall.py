@@ -15,6 +15,7 @@ from pathlib import Path
 
 WORLDS = ("etna", "mars", "morocco")
 SHOWN_THRESHOLDS = (3, 4, 5, 6, 8)
+SHOWN_NUMBERS = ("precision", "pose_precision", "recall")
 
 
 def terrainloop(*words):
@@ -36,8 +37,12 @@ def score(mission, run, preset, options):
     return terrainloop("evaluate", run, "--truth", mission / "truth.tum", *options)
 
 
+def _number(value):
+    return "-" if value is None else f"{value:.2f}"
+
+
 def markdown(results):
-    heads = [f"n >= {n}: P / R" for n in SHOWN_THRESHOLDS]
+    heads = [f"n >= {n}" for n in SHOWN_THRESHOLDS]
     yield (
         "| mission | pairs (true) | "
         + " | ".join(heads)
@@ -46,19 +51,14 @@ def markdown(results):
     yield "|---" * (len(heads) + 6) + "|"
     for name, result in results.items():
         points = {point["min_inliers"]: point for point in result["precision_recall"]}
-        cells = [
-            "-"
-            if points[n]["precision"] is None
-            else f"{points[n]['precision']:.2f} / {points[n]['recall']:.2f}"
-            for n in SHOWN_THRESHOLDS
-        ]
+        cells = [" / ".join(_number(points[n][key]) for key in SHOWN_NUMBERS) for n in SHOWN_THRESHOLDS]
         best = result["recall_before_first_disjoint"]
         yield (
             f"| {name} | {result['pairs']} ({result['true_pairs']}) | {' | '.join(cells)} "
-            f"| {best['0.3-1'] or 0:.2f} | {best['0.1-0.3'] or 0:.2f} "
+            f"| {_number(best['0.3-1'])} | {_number(best['0.1-0.3'])} "
             f"| {result['accepted']} ({result['accepted_wrong_pose']}) "
-            f"| {result['median_position_error_m'] or 0:.2f} m, "
-            f"{result['median_yaw_error_deg'] or 0:.2f} deg |"
+            f"| {_number(result['median_position_error_m'])} m, "
+            f"{_number(result['median_yaw_error_deg'])} deg |"
         )
 
 
