@@ -284,3 +284,25 @@ def test_what_is_no_map_is_an_error(tmp_path, bumpy, spoil):
         GradientMap.load(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_masts_and_flying_pixels_are_no_terrain(cloud, bumpy):
+    """Points far off the plane leave the map of the ground as it was; the paper's map keeps them."""
+    rng = np.random.default_rng(3)
+    inner = rng.uniform([1.5, -1.5], [4.5, 0.5], (12, 2))
+    dirty = np.vstack([cloud, np.c_[inner, rng.uniform(2.0, 5.0, 12) * rng.choice([-1, 1], 12)]])
+    np.testing.assert_allclose(
+        GradientMap.from_points(dirty, **GIVEN, resolution=0.1).elevation, bumpy.elevation, rtol=0, atol=1e-6
+    )
+    kept = GradientMap.from_points(dirty, **GIVEN, resolution=0.1, remove_plane=False)
+    assert np.abs(kept.elevation - bumpy.elevation).max() > 0.3
+
+
+def test_a_rock_is_terrain(cloud):
+    rock = np.hypot(cloud[:, 0] - 3.0, cloud[:, 1] + 0.5) < 0.3
+    with_rock = cloud + np.outer(rock, [0, 0, 0.15])
+    difference = (
+        GradientMap.from_points(with_rock, **GIVEN, resolution=0.1).elevation
+        - GradientMap.from_points(cloud, **GIVEN, resolution=0.1).elevation
+    )
+    assert difference.max() > 0.1
