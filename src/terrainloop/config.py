@@ -85,7 +85,7 @@ class Settings(_Frozen):
                     remove_plane=False,
                 ),
                 features=FeatureSettings(kind="surf"),
-                match=MatchSettings(max_ssd_ratio=1.0),
+                match=MatchSettings(inlier_radius=0.09, max_ssd_ratio=1.0),
             )
         raise TerrainLoopError(
             expected="preset 'default' or 'paper'", found=repr(name), mend="name one of the two"
