@@ -118,7 +118,7 @@ def show(console: Console, summary: dict[str, Any]) -> None:
         for row in summary["precision_recall"]
     ]
     title = f"True match: bounding-box IoU > {summary['min_overlap']:g}"
-    heads = ["n >=", "precision", "recall", "TP", "FP", "FN", "share with the right pose"]
+    heads = ["n >=", "precision", "recall", "TP", "FP", "FN", "right pose"]
     console.print(table_of(title, heads, rows))
     console.print(
         f"\n{summary['pairs']} pairs scored, {summary['true_pairs']} of them true. "

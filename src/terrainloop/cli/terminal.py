@@ -87,11 +87,10 @@ def _plain(value: Any) -> Any:
 
 
 def table_of(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """A table with numbers to the right and the last column to the left."""
+    """A table with its columns to the right, as numbers are read."""
     table = Table(title=title, title_justify="left", show_edge=False, pad_edge=False)
-    for number, column in enumerate(columns):
-        text = number in (0, len(columns) - 1)
-        table.add_column(column, justify="left" if text else "right", no_wrap=number < len(columns) - 1)
+    for column in columns:
+        table.add_column(column, justify="right", no_wrap=True)
     for row in rows:
         table.add_row(*row)
     return table
