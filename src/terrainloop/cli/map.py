@@ -1,9 +1,10 @@
 """``terrainloop map``: one gradient map."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
 
 from terrainloop.cli.terminal import (
     ConfigOption,
@@ -21,6 +22,7 @@ from terrainloop.errors import TerrainLoopError
 
 if TYPE_CHECKING:
     from terrainloop.gradient_map import GradientMap
+    from terrainloop.submap import Submap
 
 
 def command(
@@ -58,29 +60,36 @@ def command(
         picture = output.with_suffix(".png")
         save_figure(figure_map(submap, gradient_map), picture)
         written.append(str(picture))
-    parameters, (rows, columns) = gradient_map.parameters, gradient_map.mask.shape
-    summary = {
-        "cloud": str(cloud),
+    terminal.result(
+        _summary(submap, gradient_map) | {"written": written},
+        lambda console: _show(console, submap, gradient_map, written),
+    )
+
+
+def _summary(submap: "Submap", gradient_map: "GradientMap") -> dict[str, Any]:
+    rows, columns = gradient_map.mask.shape
+    return {
+        "cloud": submap.name,
         "points": len(submap),
         "repairs": list(submap.repairs),
         "rows": rows,
         "columns": columns,
         "resolution_m": gradient_map.resolution,
         "origin_m": list(gradient_map.origin),
-        "length_scale_m": parameters.length_scale,
-        "variance_m2": parameters.variance,
-        "noise_m": parameters.noise,
+        "length_scale_m": gradient_map.parameters.length_scale,
+        "variance_m2": gradient_map.parameters.variance,
+        "noise_m": gradient_map.parameters.noise,
         "known_share": float(gradient_map.mask.mean()),
-        "written": written,
     }
-    terminal.result(
-        summary,
-        lambda console: console.print(
-            f"{len(submap)} points -> {columns} x {rows} pixels of {gradient_map.resolution:.3g} m, "
-            f"{gradient_map.mask.mean():.0%} known ground\n"
-            f"length scale {parameters.length_scale:.3g} m, relief {parameters.variance**0.5:.3g} m, "
-            f"noise {parameters.noise:.3g} m\nwritten: {', '.join(written)}"
-        ),
+
+
+def _show(console: Console, submap: "Submap", gradient_map: "GradientMap", written: list[str]) -> None:
+    parameters, (rows, columns) = gradient_map.parameters, gradient_map.mask.shape
+    console.print(
+        f"{len(submap)} points -> {columns} x {rows} pixels of {gradient_map.resolution:.3g} m, "
+        f"{gradient_map.mask.mean():.0%} known ground\n"
+        f"length scale {parameters.length_scale:.3g} m, relief {parameters.variance**0.5:.3g} m, "
+        f"noise {parameters.noise:.3g} m\nwritten: {', '.join(written)}"
     )
 
 
