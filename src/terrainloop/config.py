@@ -29,7 +29,9 @@ class MapSettings(_Frozen):
     resolution: float | None = Field(
         None, gt=0, description="grid spacing, m per pixel; null: a sixth of the length scale"
     )
-    remove_plane: bool = Field(True, description="take out a plane and points far off it, give the slope back after")
+    remove_plane: bool = Field(
+        True, description="take a plane out, and points far off it; give its slope back"
+    )
     max_variance_ratio: float = Field(
         0.25, gt=0, lt=1, description="ground is known where the variance is below this share of the prior's"
     )
