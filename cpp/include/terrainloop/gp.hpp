@@ -1,0 +1,50 @@
+#pragma once
+
+#include <cstddef>
+
+/// The Gaussian process over the elevations of a cloud, from every point, in time linear in points and area.
+///
+/// Model: z_i = f(x_i, y_i) + n_i, n_i ~ N(0, s_i^2), f a zero-mean process with covariance
+/// variance * exp(-d^2 / (2 length_scale^2)). docs/solver.md has the equations and the error budget.
+namespace terrainloop::gp {
+
+struct Hyperparameters {
+  double length_scale;  ///< metres
+  double variance;      ///< of f, metres squared
+};
+
+/// Training data; nothing is copied or kept.
+struct Points {
+  const double* xy;         ///< (count, 2) row-major, metres
+  const double* elevation;  ///< (count), metres, near zero mean
+  const double* noise;      ///< (count), standard deviation of each elevation, metres, > 0
+  std::size_t count;
+};
+
+/// Pixel (row, col) lies at (x + resolution * col, y + resolution * row).
+struct Grid {
+  double x, y, resolution;  ///< metres
+  int rows, cols;
+};
+
+/// Where the posterior goes, row-major (rows, cols) or (count); each may be null and is then not computed.
+struct Maps {
+  float* elevation;
+  float* gradient_x;
+  float* gradient_y;
+  float* variance;           ///< of the elevation, metres squared
+  float* gradient_variance;  ///< mean of the variances of the two components of the gradient
+};
+
+/// Posterior on a grid, with `threads` threads in all. The bytes do not depend on their number.
+/// Memory, beside the arguments: 48 bytes a point and at most 0.7 GB, whatever the area.
+/// Throws std::invalid_argument for numbers that make no model, std::runtime_error where the equations
+/// cannot be solved to tolerance.
+void predict_grid(const Points& points, const Hyperparameters& parameters, const Grid& grid, const Maps& maps,
+                  int threads = 1);
+
+/// As predict_grid, at `count` arbitrary places: `queries` is (count, 2) row-major, metres.
+void predict_at(const Points& points, const Hyperparameters& parameters, const double* queries,
+                std::size_t count, const Maps& maps, int threads = 1);
+
+}  // namespace terrainloop::gp
