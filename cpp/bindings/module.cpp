@@ -10,6 +10,7 @@
 #include <utility>
 #include <vector>
 
+#include "terrainloop/gp.hpp"
 #include "terrainloop/surf.hpp"
 
 namespace nb = nanobind;
@@ -91,11 +92,64 @@ auto fast_hessian(const AnyArray& image, int filter_size) {
   return to_numpy(std::move(response), pixels.rows, pixels.cols);
 }
 
+using Doubles = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
+
+gp::Points points_view(const Doubles& xy, const Doubles& elevation, const Doubles& noise) {
+  if (xy.ndim() != 2 || xy.shape(1) != 2) throw nb::value_error("xy must be (N, 2)");
+  for (const Doubles* column : {&elevation, &noise})
+    if (column->ndim() != 1 || column->shape(0) != xy.shape(0))
+      throw nb::value_error("elevation and noise must have one number a point");
+  return {xy.data(), elevation.data(), noise.data(), xy.shape(0)};
+}
+
+/// Arrays for the five maps and their views, filled by predict(maps) without the GIL.
+template <typename Shape, typename Predict>
+nb::list five_maps(std::size_t count, const Shape& shape, const Predict& predict) {
+  std::vector<std::unique_ptr<float[]>> images;
+  for (int i = 0; i < 5; ++i) images.emplace_back(new float[count]);
+  {
+    nb::gil_scoped_release release;
+    predict(gp::Maps{images[0].get(), images[1].get(), images[2].get(), images[3].get(), images[4].get()});
+  }
+  nb::list maps;
+  for (std::unique_ptr<float[]>& image : images) {
+    float* data = image.release();
+    nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<float*>(p); });
+    maps.append(nb::ndarray<nb::numpy, float>(data, shape.size(), shape.begin(), owner));
+  }
+  return maps;
+}
+
+nb::list gp_predict_grid(const Doubles& xy, const Doubles& elevation, const Doubles& noise, double length_scale,
+                         double variance, double x, double y, double resolution, int rows, int cols,
+                         int threads) {
+  const gp::Points points = points_view(xy, elevation, noise);
+  if (rows < 0 || cols < 0) throw nb::value_error("rows and cols must not be negative");
+  const std::initializer_list<std::size_t> shape = {static_cast<std::size_t>(rows), static_cast<std::size_t>(cols)};
+  return five_maps(static_cast<std::size_t>(rows) * cols, shape, [&](const gp::Maps& maps) {
+    gp::predict_grid(points, {length_scale, variance}, {x, y, resolution, rows, cols}, maps, threads);
+  });
+}
+
+nb::list gp_predict_at(const Doubles& xy, const Doubles& elevation, const Doubles& noise, double length_scale,
+                       double variance, const Doubles& queries, int threads) {
+  const gp::Points points = points_view(xy, elevation, noise);
+  if (queries.ndim() != 2 || queries.shape(1) != 2) throw nb::value_error("queries must be (Q, 2)");
+  const std::initializer_list<std::size_t> shape = {queries.shape(0)};
+  return five_maps(queries.shape(0), shape, [&](const gp::Maps& maps) {
+    gp::predict_at(points, {length_scale, variance}, queries.data(), queries.shape(0), maps, threads);
+  });
+}
+
 }  // namespace
 }  // namespace terrainloop
 
 NB_MODULE(_core, module) {
   module.def("surf", &terrainloop::surf_extract, "image"_a, "mask"_a = nb::none(), nb::kw_only(),
              "threshold"_a = 0.0, "octaves"_a = 4, "intervals"_a = 4, "max_keypoints"_a = nb::none());
+  module.def("gp_predict_grid", &terrainloop::gp_predict_grid, "xy"_a, "elevation"_a, "noise"_a, nb::kw_only(),
+             "length_scale"_a, "variance"_a, "x"_a, "y"_a, "resolution"_a, "rows"_a, "cols"_a, "threads"_a = 1);
+  module.def("gp_predict_at", &terrainloop::gp_predict_at, "xy"_a, "elevation"_a, "noise"_a, nb::kw_only(),
+             "length_scale"_a, "variance"_a, "queries"_a, "threads"_a = 1);
   module.def("fast_hessian", &terrainloop::fast_hessian, "image"_a, "filter_size"_a);
 }

@@ -14,19 +14,35 @@ struct Basis {
   BasisRow value, slope;
 };
 
-/// The functions that are not zero on a cell, from the leftmost on, at t within [0, 1] of it; slopes are
-/// per unit of the lattice (Cox - de Boor).
-inline Basis basis_at(double t) {
-  BasisRow b{1.0}, lower{};
+/// Coefficients [power][function] of the polynomials that the functions are on a cell, from the leftmost
+/// on, by the recursion of Cox and de Boor.
+constexpr std::array<BasisRow, kSupport> basis_coefficients() {
+  std::array<BasisRow, kSupport> c{}, lower{};
+  c[0][0] = 1.0;
   for (int d = 1; d <= kDegree; ++d) {
-    lower = b;
-    for (int j = d; j >= 0; --j)
-      b[j] = ((j > 0 ? (t + d - j) * lower[j - 1] : 0.0) + (j < d ? (1.0 - t + j) * lower[j] : 0.0)) / d;
+    lower = c;
+    for (int j = 0; j <= d; ++j)
+      for (int p = 0; p <= d; ++p) {
+        // ((t + d - j) lower_{j-1} + (1 - t + j) lower_j) / d
+        double sum = 0.0;
+        if (j > 0) sum += (d - j) * lower[p][j - 1] + (p > 0 ? lower[p - 1][j - 1] : 0.0);
+        if (j < d) sum += (1 + j) * lower[p][j] - (p > 0 ? lower[p - 1][j] : 0.0);
+        c[p][j] = sum / d;
+      }
   }
-  BasisRow slope;
-  for (int j = 0; j <= kDegree; ++j)
-    slope[j] = (j > 0 ? lower[j - 1] : 0.0) - (j < kDegree ? lower[j] : 0.0);
-  return {b, slope};
+  return c;
+}
+
+/// The functions that are not zero on a cell at t within [0, 1] of it; slopes are per unit of the lattice.
+inline Basis basis_at(double t) {
+  static constexpr std::array<BasisRow, kSupport> c = basis_coefficients();
+  Basis basis{c[kDegree], {}};
+  for (int p = kDegree - 1; p >= 0; --p)
+    for (int j = 0; j < kSupport; ++j) {
+      basis.slope[j] = basis.slope[j] * t + basis.value[j];
+      basis.value[j] = basis.value[j] * t + c[p][j];
+    }
+  return basis;
 }
 
 }  // namespace terrainloop::gp

@@ -1,0 +1,61 @@
+#include "solve.hpp"
+
+#include <cmath>
+#include <stdexcept>
+
+namespace terrainloop::gp {
+namespace {
+
+constexpr int kMaxSteps = 40;
+constexpr double kTolerance = 5e-4;  // a correction, as a share of the solution; the error left is far smaller
+
+/// Size of what the weights say about the slopes.
+double roughness(const RowMatrix& w) {
+  return std::sqrt((w.rightCols(w.cols() - 1) - w.leftCols(w.cols() - 1)).squaredNorm() +
+                   (w.bottomRows(w.rows() - 1) - w.topRows(w.rows() - 1)).squaredNorm());
+}
+
+RowMatrix precondition(const std::vector<Subdomain>& subdomains, const RowMatrix& residual, Workers& workers) {
+  std::vector<RowMatrix> parts(subdomains.size());
+  workers.run(static_cast<int>(parts.size()), [&](int i) { parts[i] = subdomains[i].solve(residual); });
+  RowMatrix sum = RowMatrix::Zero(residual.rows(), residual.cols());
+  for (std::size_t i = 0; i < parts.size(); ++i)
+    sum.block(subdomains[i].rows().first_knot, subdomains[i].cols().first_knot, parts[i].rows(),
+              parts[i].cols()) += parts[i];
+  return sum;
+}
+
+RowMatrix product(const Information& information, const Precision& precision, const RowMatrix& w, Workers& workers) {
+  RowMatrix out = precision.rows * w * precision.cols / precision.variance;
+  information.add_product(w, out, workers);
+  return out;
+}
+
+double dot(const RowMatrix& a, const RowMatrix& b) { return a.cwiseProduct(b).sum(); }
+
+}  // namespace
+
+RowMatrix solve_weights(const Information& information, const Precision& precision,
+                        const std::vector<Subdomain>& subdomains, Workers& workers) {
+  RowMatrix residual = information.vector();
+  RowMatrix w = RowMatrix::Zero(residual.rows(), residual.cols());
+  if (residual.isZero(0.0)) return w;
+  std::vector<RowMatrix> steps, products;
+  for (int k = 0; k < kMaxSteps; ++k) {
+    RowMatrix step = precondition(subdomains, residual, workers);
+    const double correction = roughness(step), whole = roughness(w + step);
+    if (correction <= kTolerance * whole) return w + step;
+    for (std::size_t i = 0; i < steps.size(); ++i) step -= dot(step, products[i]) * steps[i];
+    RowMatrix image = product(information, precision, step, workers);
+    const double energy = dot(step, image);
+    if (!(energy > 0.0) || !std::isfinite(energy)) break;
+    steps.push_back(step / std::sqrt(energy));
+    products.push_back(image / std::sqrt(energy));
+    const double length = dot(residual, steps.back());
+    w += length * steps.back();
+    residual -= length * products.back();
+  }
+  throw std::runtime_error("the equations of the weights did not converge");
+}
+
+}  // namespace terrainloop::gp

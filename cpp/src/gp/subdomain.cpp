@@ -1,0 +1,173 @@
+#include "subdomain.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+
+namespace terrainloop::gp {
+namespace {
+
+constexpr int kCells = 10;        // a subdomain answers for, along each axis
+constexpr double kPinning = 0.1;  // weight of the whole axis' precision against the interval's own
+constexpr int kBlock = 64;        // columns at a time, so that a product's operands stay in cache
+
+/// Weights that fall smoothly from one to zero over the knots two intervals share.
+Eigen::VectorXd window(const Interval& interval, int knots, int margin) {
+  const double width = 2.0 * margin + 2.0;
+  return Eigen::VectorXd::NullaryExpr(interval.knots(), [&](Eigen::Index k) {
+    double w = 1.0;
+    if (interval.first_knot > 0) w = std::min(w, (k + 1) / width);
+    if (interval.last_knot < knots) w = std::min(w, (interval.knots() - k) / width);
+    return w * w * (3.0 - 2.0 * w);
+  });
+}
+
+/// In place, the inverse of a lower triangular matrix whose upper triangle is zero.
+void invert_lower(Eigen::Ref<Eigen::MatrixXf> lower) {
+  const Eigen::Index n = lower.rows();
+  if (n <= 32) {
+    Eigen::MatrixXf result = Eigen::MatrixXf::Identity(n, n);
+    lower.triangularView<Eigen::Lower>().solveInPlace(result);
+    lower = result;
+    return;
+  }
+  const Eigen::Index half = (n / 2 + 7) / 8 * 8;
+  auto corner = lower.bottomLeftCorner(n - half, half);
+  invert_lower(lower.topLeftCorner(half, half));
+  invert_lower(lower.bottomRightCorner(n - half, n - half));
+  const Eigen::MatrixXf inner = corner * lower.topLeftCorner(half, half).triangularView<Eigen::Lower>();
+  corner.noalias() = -(lower.bottomRightCorner(n - half, n - half) * inner);
+}
+
+/// Lower triangle of V' V for a lower triangular V.
+Eigen::MatrixXf square(const Eigen::MatrixXf& v) {
+  const Eigen::Index n = v.rows();
+  Eigen::MatrixXf result(n, n);
+  for (Eigen::Index i = 0; i < n; i += kBlock) {
+    const Eigen::Index width = std::min<Eigen::Index>(kBlock, n - i);
+    result.block(i, 0, width, i + width).noalias() =
+        v.block(i, i, n - i, width).transpose() * v.block(i, 0, n - i, i + width);
+  }
+  return result;
+}
+
+}  // namespace
+
+std::vector<Interval> cut(int cells, int margin, const std::vector<double>& covariance, const Matrix& precision) {
+  const int count = (cells + kCells - 1) / kCells, knots = cells + kDegree;
+  std::vector<Interval> intervals(count);
+  Eigen::VectorXd total = Eigen::VectorXd::Zero(knots);
+  Matrix own;
+  for (int i = 0; i < count; ++i) {
+    Interval& interval = intervals[i];
+    interval.first_cell = static_cast<int>(static_cast<long>(i) * cells / count);
+    interval.last_cell = static_cast<int>(static_cast<long>(i + 1) * cells / count);
+    // Cell c spans knots c + 3 .. c + 4.
+    interval.first_knot = std::max(0, interval.first_cell + kDegree / 2 - margin);
+    interval.last_knot = std::min(knots, interval.last_cell + kDegree / 2 + margin + 1);
+    interval.share = window(interval, knots, margin);
+    total.segment(interval.first_knot, interval.knots()) += interval.share;
+    if (own.rows() != interval.knots()) own = inverse(toeplitz(covariance, interval.knots()));
+    interval.precision = (1.0 - kPinning) * own +
+                         kPinning * precision.block(interval.first_knot, interval.first_knot, interval.knots(),
+                                                    interval.knots());
+  }
+  for (Interval& interval : intervals)
+    interval.share.array() /= total.segment(interval.first_knot, interval.knots()).array();
+  return intervals;
+}
+
+PackedFactor::PackedFactor(const Matrix& lower) : size_(static_cast<int>(lower.rows())) {
+  std::size_t count = 0;
+  for (int first = 0; first < size_; first += kPanel) count += (size_ - first) * std::min(kPanel, size_ - first);
+  values_.resize(count);
+  float* values = values_.data();
+  for (int first = 0; first < size_; first += kPanel) {
+    const int width = std::min(kPanel, size_ - first), height = size_ - first;
+    Eigen::Map<Eigen::MatrixXf>(values, height, width) = lower.block(first, first, height, width).cast<float>();
+    values += static_cast<std::ptrdiff_t>(height) * width;
+  }
+}
+
+void PackedFactor::solve(Eigen::VectorXf& x) const {
+  using Panel = Eigen::Map<const Eigen::MatrixXf>;
+  const float* values = values_.data();
+  for (int first = 0; first < size_; first += kPanel) {
+    const int width = std::min(kPanel, size_ - first), height = size_ - first, rest = height - width;
+    const Panel panel(values, height, width);
+    auto head = x.segment(first, width);
+    panel.topRows(width).triangularView<Eigen::Lower>().solveInPlace(head);
+    x.tail(rest).noalias() -= panel.bottomRows(rest) * head;
+    values += static_cast<std::ptrdiff_t>(height) * width;
+  }
+  for (int first = (size_ - 1) / kPanel * kPanel; first >= 0; first -= kPanel) {
+    const int width = std::min(kPanel, size_ - first), height = size_ - first, rest = height - width;
+    values -= static_cast<std::ptrdiff_t>(height) * width;
+    const Panel panel(values, height, width);
+    auto head = x.segment(first, width);
+    head.noalias() -= panel.bottomRows(rest).transpose() * x.tail(rest);
+    panel.topRows(width).triangularView<Eigen::Lower>().transpose().solveInPlace(head);
+  }
+}
+
+Subdomain::Subdomain(const Interval& rows, const Interval& cols) : rows_(&rows), cols_(&cols) {
+  const int core_rows = rows.cells() + kDegree, core_cols = cols.cells() + kDegree;
+  int next = 0, next_core = rows.knots() * cols.knots() - core_rows * core_cols;
+  for (int row = 0; row < rows.knots(); ++row)
+    for (int col = 0; col < cols.knots(); ++col) {
+      const bool core = row >= rows.support() && row < rows.support() + core_rows && col >= cols.support() &&
+                        col < cols.support() + core_cols;
+      position_.push_back(core ? next_core++ : next++);
+    }
+}
+
+void Subdomain::assemble(const Information& information, double variance, Matrix& matrix) const {
+  const int rows = rows_->knots(), cols = cols_->knots();
+  matrix.resize(rows * cols, rows * cols);
+  Matrix pair(cols, cols);  // of two rows of knots
+  for (int i = 0; i < rows; ++i)
+    for (int j = i; j < rows; ++j) {
+      pair = rows_->precision(j, i) / variance * cols_->precision;
+      for (int a = 0; a < cols && j - i < kSupport; ++a) {
+        const double* entry = information.at(rows_->first_knot + i, cols_->first_knot + a) + kSupport * (j - i);
+        const int reach = std::min(kSupport, cols - a);
+        for (int b = 0; b < reach; ++b) pair(a + b, a) += entry[b];
+        for (int b = 1; b < reach; ++b) pair(a, a + b) += entry[b];
+      }
+      const int *at_i = &position_[i * cols], *at_j = &position_[j * cols];
+      for (int a = 0; a < cols; ++a) {
+        double *column_i = &matrix(0, at_i[a]), *column_j = &matrix(0, at_j[a]);
+        for (int b = 0; b < cols; ++b) column_i[at_j[b]] = column_j[at_i[b]] = pair(b, a);
+      }
+    }
+}
+
+void Subdomain::factorise(const Information& information, double variance, Eigen::MatrixXf* covariance) {
+  Matrix lower;
+  assemble(information, variance, lower);
+  const Eigen::LLT<Eigen::Ref<Matrix>> factor(lower);
+  if (factor.info() != Eigen::Success || !lower.diagonal().allFinite())
+    throw std::runtime_error("the equations of a subdomain are not positive definite");
+  factor_ = PackedFactor(lower);
+  if (covariance == nullptr) return;
+  const int core = (rows_->cells() + kDegree) * (cols_->cells() + kDegree);
+  Eigen::MatrixXf inverse = lower.bottomRightCorner(core, core).cast<float>().triangularView<Eigen::Lower>();
+  invert_lower(inverse);
+  *covariance = square(inverse);
+}
+
+RowMatrix Subdomain::solve(const RowMatrix& rhs) const {
+  const int rows = rows_->knots(), cols = cols_->knots();
+  Eigen::VectorXf x(rows * cols);
+  for (int row = 0; row < rows; ++row)
+    for (int col = 0; col < cols; ++col)
+      x[position_[row * cols + col]] = static_cast<float>(rhs(rows_->first_knot + row, cols_->first_knot + col));
+  factor_.solve(x);
+  RowMatrix solution(rows, cols);
+  for (int row = 0; row < rows; ++row)
+    for (int col = 0; col < cols; ++col)
+      solution(row, col) = x[position_[row * cols + col]] * rows_->share[row] * cols_->share[col];
+  return solution;
+}
+
+}  // namespace terrainloop::gp
