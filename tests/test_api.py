@@ -105,7 +105,7 @@ def test_the_documented_presets_make_a_detector(preset):
 
 def test_types_are_shipped():
     assert (PACKAGE / "py.typed").is_file()
-    assert (PACKAGE / "_core.pyi").is_file()
+    assert (PACKAGE / "_core" / "__init__.pyi").is_file()
 
 
 def test_version():

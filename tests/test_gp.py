@@ -125,12 +125,13 @@ def test_likelihood_gradient_equals_finite_differences(surface):
     assert error < 1e-5 * np.linalg.norm(gradient)
 
 
-def test_fit_recovers_what_the_surface_was_drawn_from():
+@pytest.mark.parametrize("exact", [False, True])
+def test_fit_recovers_what_the_surface_was_drawn_from(exact):
     clouds = []
     for seed in range(3):
         xy, elevation = draw_surface(seed, count=500, extent=5.0)
         clouds.append(np.c_[xy, elevation])
-    fitted = fit_hyperparameters(clouds, remove_plane=False)
+    fitted = fit_hyperparameters(clouds, exact=exact, remove_plane=False, workers=2)
     assert fitted.length_scale == pytest.approx(PARAMETERS.length_scale, rel=0.1)
     assert fitted.noise == pytest.approx(PARAMETERS.noise, rel=0.1)
     assert fitted.variance == pytest.approx(PARAMETERS.variance, rel=0.4)
@@ -138,7 +139,7 @@ def test_fit_recovers_what_the_surface_was_drawn_from():
 
 def test_fixed_hyperparameters_stay(surface):
     xy, elevation = surface
-    data = Surface(xy, elevation, np.zeros(3), np.zeros(2))
+    data = Surface(xy, elevation, np.zeros(3), np.zeros(2), np.ones(len(xy)))
     start = Hyperparameters(0.5, 0.1, 0.05)
     fitted = maximise_likelihood([data], start, fixed=["noise"])
     assert fitted.noise == pytest.approx(0.05, rel=1e-12)

@@ -1,16 +1,20 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
 
 #include <algorithm>
 #include <cmath>
 #include <memory>
 #include <optional>
 #include <string>
+#include <tuple>
 #include <utility>
 #include <vector>
 
 #include "terrainloop/gp.hpp"
+#include "terrainloop/likelihood.hpp"
 #include "terrainloop/surf.hpp"
 
 namespace nb = nanobind;
@@ -120,12 +124,13 @@ nb::list five_maps(std::size_t count, const Shape& shape, const Predict& predict
   return maps;
 }
 
-nb::list gp_predict_grid(const Doubles& xy, const Doubles& elevation, const Doubles& noise, double length_scale,
-                         double variance, double x, double y, double resolution, int rows, int cols,
-                         int threads) {
+nb::list gp_predict_grid(const Doubles& xy, const Doubles& elevation, const Doubles& noise,
+                         double length_scale, double variance, double x, double y, double resolution,
+                         int rows, int cols, int threads) {
   const gp::Points points = points_view(xy, elevation, noise);
   if (rows < 0 || cols < 0) throw nb::value_error("rows and cols must not be negative");
-  const std::initializer_list<std::size_t> shape = {static_cast<std::size_t>(rows), static_cast<std::size_t>(cols)};
+  const std::initializer_list<std::size_t> shape = {static_cast<std::size_t>(rows),
+                                                    static_cast<std::size_t>(cols)};
   return five_maps(static_cast<std::size_t>(rows) * cols, shape, [&](const gp::Maps& maps) {
     gp::predict_grid(points, {length_scale, variance}, {x, y, resolution, rows, cols}, maps, threads);
   });
@@ -141,15 +146,61 @@ nb::list gp_predict_at(const Doubles& xy, const Doubles& elevation, const Double
   });
 }
 
+auto gp_noise_ratio(const Doubles& xy, const Doubles& elevation, double cell, int threads) {
+  const gp::Points points = points_view(xy, elevation, elevation);
+  std::vector<double> ratio(points.count);
+  {
+    nb::gil_scoped_release release;
+    gp::noise_ratio(points.xy, points.elevation, points.count, cell, ratio.data(), threads);
+  }
+  return to_numpy(std::move(ratio), points.count, 1);
+}
+
+nb::tuple gp_block_likelihood(const std::vector<std::tuple<Doubles, Doubles, Doubles>>& surfaces,
+                              double length_scale, double variance, double noise, double side, double work,
+                              int threads) {
+  std::vector<gp::Points> points;
+  for (const auto& [xy, elevation, relative_noise] : surfaces)
+    points.push_back(points_view(xy, elevation, relative_noise));
+  std::shared_ptr<const gp::BlockLikelihood> likelihood;
+  {
+    nb::gil_scoped_release release;
+    const gp::Hyperparameters about{length_scale, variance};
+    likelihood = std::make_shared<gp::BlockLikelihood>(points, about, noise, side, work, threads);
+  }
+  const auto evaluate = [likelihood](double length_scale, double variance, double noise) {
+    nb::gil_scoped_release release;
+    const std::array<double, 4> terms = (*likelihood)({length_scale, variance}, noise);
+    return std::make_tuple(terms[0], std::make_tuple(terms[1], terms[2], terms[3]));
+  };
+  return nb::make_tuple(nb::cpp_function(evaluate), likelihood->blocks(), likelihood->rank(),
+                        likelihood->points());
+}
+
 }  // namespace
 }  // namespace terrainloop
 
-NB_MODULE(_core, module) {
+NB_MODULE(TERRAINLOOP_MODULE, module) {
+  module.attr("VARIANT") = TERRAINLOOP_VARIANT;
+#if defined(__AVX512VL__)
+  module.attr("LEVEL") = 4;
+#elif defined(__AVX2__)
+  module.attr("LEVEL") = 3;
+#elif defined(__SSE4_2__)
+  module.attr("LEVEL") = 2;
+#else
+  module.attr("LEVEL") = 0;
+#endif
   module.def("surf", &terrainloop::surf_extract, "image"_a, "mask"_a = nb::none(), nb::kw_only(),
              "threshold"_a = 0.0, "octaves"_a = 4, "intervals"_a = 4, "max_keypoints"_a = nb::none());
-  module.def("gp_predict_grid", &terrainloop::gp_predict_grid, "xy"_a, "elevation"_a, "noise"_a, nb::kw_only(),
-             "length_scale"_a, "variance"_a, "x"_a, "y"_a, "resolution"_a, "rows"_a, "cols"_a, "threads"_a = 1);
+  module.def("gp_predict_grid", &terrainloop::gp_predict_grid, "xy"_a, "elevation"_a, "noise"_a,
+             nb::kw_only(), "length_scale"_a, "variance"_a, "x"_a, "y"_a, "resolution"_a, "rows"_a, "cols"_a,
+             "threads"_a = 1);
   module.def("gp_predict_at", &terrainloop::gp_predict_at, "xy"_a, "elevation"_a, "noise"_a, nb::kw_only(),
              "length_scale"_a, "variance"_a, "queries"_a, "threads"_a = 1);
+  module.def("gp_noise_ratio", &terrainloop::gp_noise_ratio, "xy"_a, "elevation"_a, nb::kw_only(), "cell"_a,
+             "threads"_a = 1);
+  module.def("gp_block_likelihood", &terrainloop::gp_block_likelihood, "surfaces"_a, nb::kw_only(),
+             "length_scale"_a, "variance"_a, "noise"_a, "side"_a, "work"_a, "threads"_a = 1);
   module.def("fast_hessian", &terrainloop::fast_hessian, "image"_a, "filter_size"_a);
 }

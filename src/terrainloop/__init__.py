@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from terrainloop.errors import TerrainLoopError
     from terrainloop.gp.hyperparameters import fit_hyperparameters
     from terrainloop.gp.kernel import Hyperparameters
+    from terrainloop.gp.process import ElevationProcess
     from terrainloop.gradient_map import GradientMap
     from terrainloop.io.clouds import read_cloud
     from terrainloop.io.missions import Mission, load_mission
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from terrainloop.submap import Submap
 
 _HOME = {
+    "ElevationProcess": "gp.process",
     "GradientMap": "gradient_map",
     "Hyperparameters": "gp.kernel",
     "LoopCandidate": "loop",
@@ -33,6 +35,7 @@ _HOME = {
 }
 
 __all__ = [
+    "ElevationProcess",
     "GradientMap",
     "Hyperparameters",
     "LoopCandidate",

@@ -16,12 +16,20 @@ class _Frozen(BaseModel):
 class MapSettings(_Frozen):
     """How a submap becomes a gradient map."""
 
-    max_points: int = Field(5000, ge=50, description="points kept per submap, drawn at random")
+    solver: Literal["spline", "exact"] = Field(
+        "spline", description="spline: every point, in milliseconds; exact: dense, for a few thousand points"
+    )
+    max_points: int | None = Field(
+        None, ge=50, description="points kept per submap, drawn at random; null: all"
+    )
     length_scale: float | None = Field(
         None, gt=0, description="starting length scale of the kernel, m; null: twice the point spacing"
     )
     noise: float | None = Field(
         None, gt=0, description="starting accuracy of the elevations, m; null: a fifth of the relief"
+    )
+    local_noise: bool = Field(
+        True, description="scale the noise by the scatter around each point, as stereo's grows with range"
     )
     fit: Literal["database", "submap"] = Field(
         "database", description="maximise the likelihood once (maps stay comparable) or for every submap"
@@ -80,8 +88,11 @@ class Settings(_Frozen):
         if name == "paper":
             return cls(
                 map=MapSettings(
+                    solver="exact",
+                    max_points=5000,
                     length_scale=0.316,
                     noise=0.02,
+                    local_noise=False,
                     fit="submap",
                     resolution=0.03,
                     remove_plane=False,

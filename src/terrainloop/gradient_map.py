@@ -3,7 +3,6 @@
 import io
 import zipfile
 import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -12,10 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrainloop.errors import TerrainLoopError
-from terrainloop.gp.exact import predict_grid
-from terrainloop.gp.hyperparameters import BLOCK_POINTS, maximise_likelihood
 from terrainloop.gp.kernel import Hyperparameters
-from terrainloop.gp.surface import surface_of
+from terrainloop.gp.process import ElevationProcess, Solver, check_positive
+from terrainloop.gp.surface import Surface
 from terrainloop.submap import Submap
 
 Image = NDArray[np.float32]
@@ -73,11 +71,15 @@ class GradientMap:
         points: ArrayLike | Submap,
         length_scale: float | None = None,
         variance: float | None = None,
-        noise: float | None = None,
+        noise: float | ArrayLike | None = None,
         resolution: float | None = None,
         *,
-        max_points: int = 5000,
+        origin: tuple[float, float] | None = None,
+        shape: tuple[int, int] | None = None,
+        max_points: int | None = None,
         remove_plane: bool = True,
+        local_noise: bool = True,
+        solver: Solver = "spline",
         max_variance_ratio: float = 0.25,
         seed: int = 0,
         workers: int = 1,
@@ -88,15 +90,26 @@ class GradientMap:
         ----------
         points : array_like, (N, 3), or Submap
             Gravity-aligned points, metres.
-        length_scale, variance, noise : float, optional
-            Of the process (see `Hyperparameters`): metres, metres squared, metres. Those not given
-            are fitted to this cloud.
+        length_scale, variance : float, optional
+            Of the process (see `Hyperparameters`): metres, metres squared. What is not given is fitted
+            to this cloud.
+        noise : float or array_like, (N,), optional
+            Standard deviation of the elevations, metres: one number, or one for each point.
         resolution : float, optional
             Metres per pixel; a sixth of the length scale if not given.
-        max_points : int
-            Drawn at random if the cloud has more.
+        origin : tuple of float, optional
+            (x, y) of pixel (0, 0), metres; the low corner of the bounding box if not given.
+        shape : tuple of int, optional
+            Rows (y) and columns (x); as far as the bounding box reaches if not given.
+        max_points : int, optional
+            Drawn at random if the cloud has more; all are used if not given.
         remove_plane : bool
             Take the best plane out before and give its slope back after.
+        local_noise : bool
+            Scale the noise by the scatter of the points around each (see `noise_ratio`); not done where
+            noise is given for each point.
+        solver : str
+            "spline" takes every point; "exact" is dense, for some thousands of points.
         max_variance_ratio : float
             Ground counts as known where its variance is below this share of the prior's.
         seed : int
@@ -107,29 +120,35 @@ class GradientMap:
         Raises
         ------
         TerrainLoopError
-            If the points make no submap, or the grid would be absurdly large.
+            If the points make no submap, a number is impossible, the grid would be absurdly large, or
+            the equations cannot be solved.
         """
-        surface = surface_of(points, max_points=max_points, remove_plane=remove_plane, seed=seed)
-        given = {"length_scale": length_scale, "variance": variance, "noise": noise}
-        _check_positive(given | {"resolution": resolution})
-        fixed = [name for name, value in given.items() if value is not None]
-        parameters = surface.start(**given)
-        if len(fixed) < len(given):
-            blocks = surface.blocks(BLOCK_POINTS)
-            parameters = maximise_likelihood(blocks, parameters, fixed=fixed, workers=workers)
+        check_positive(resolution=resolution)
+        process = ElevationProcess.from_points(
+            points,
+            length_scale,
+            variance,
+            noise,
+            max_points=max_points,
+            remove_plane=remove_plane,
+            local_noise=local_noise,
+            solver=solver,
+            seed=seed,
+            workers=workers,
+        )
+        parameters = process.parameters
         if resolution is None:
             resolution = parameters.length_scale / PIXELS_PER_LENGTH_SCALE
-        x, y = _axes(surface.xy, resolution)
-        field = predict_grid(surface.xy, surface.elevation, parameters, x, y, workers=workers)
-        plane = surface.centre[2] + surface.slope[0] * x + surface.slope[1] * y[:, None]
+        origin, shape = _grid(process.surface, resolution, origin, shape)
+        field = process.predict_grid(origin, resolution, shape)
         return cls(
-            elevation=(field.elevation + plane).astype(np.float32),
-            gradient_x=(field.gradient_x + surface.slope[0]).astype(np.float32),
-            gradient_y=(field.gradient_y + surface.slope[1]).astype(np.float32),
-            variance=field.variance.astype(np.float32),
-            gradient_variance=field.gradient_variance.astype(np.float32),
-            mask=field.variance < max_variance_ratio * parameters.variance,
-            origin=(float(x[0] + surface.centre[0]), float(y[0] + surface.centre[1])),
+            elevation=field.elevation.astype(np.float32, copy=False),
+            gradient_x=field.gradient_x.astype(np.float32, copy=False),
+            gradient_y=field.gradient_y.astype(np.float32, copy=False),
+            variance=field.variance.astype(np.float32, copy=False),
+            gradient_variance=field.gradient_variance.astype(np.float32, copy=False),
+            mask=field.variance < np.float32(max_variance_ratio * parameters.variance),
+            origin=origin,
             resolution=float(resolution),
             parameters=parameters,
         )
@@ -166,26 +185,33 @@ class GradientMap:
             ) from error
 
 
-def _axes(xy: NDArray[np.float64], resolution: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Grid coordinates that cover the points' bounding box."""
-    low, high = xy.min(axis=0), xy.max(axis=0)
-    width, height = (int(n) for n in np.floor((high - low) / resolution + 1e-9) + 1)
+def _grid(
+    surface: Surface,
+    resolution: float,
+    origin: tuple[float, float] | None,
+    shape: tuple[int, int] | None,
+) -> tuple[tuple[float, float], tuple[int, int]]:
+    """Origin and shape of the grid; by default it covers the points' bounding box."""
+    low, high = surface.xy.min(axis=0) + surface.centre[:2], surface.xy.max(axis=0) + surface.centre[:2]
+    corner = low if origin is None else np.asarray(origin, dtype=np.float64)
+    if shape is None:
+        width, height = (int(n) for n in np.maximum(np.floor((high - corner) / resolution + 1e-9) + 1, 0))
+    else:
+        height, width = shape
+    if width <= 0 or height <= 0 or not np.isfinite(corner).all():
+        raise TerrainLoopError(
+            expected="a grid of at least one pixel that begins below the points' upper corner",
+            found=f"{width} x {height} pixels from {corner.tolist()}; the points end at {high.tolist()}",
+            mend="change origin or shape, or leave them out",
+        )
     if width * height > MAX_PIXELS:
         raise TerrainLoopError(
             expected=f"a map of at most {MAX_PIXELS / 1e6:.0f} million pixels",
-            found=f"{width} x {height} for an extent of {high[0] - low[0]:.0f} x {high[1] - low[1]:.0f} m "
-            f"at {resolution:.3g} m per pixel",
+            found=f"{width} x {height} of {resolution:.3g} m ({21e-9 * width * height:.1f} GB) for "
+            f"{surface.extent_in_words}",
             mend="remove far outlier points, or make the resolution coarser",
         )
-    return low[0] + resolution * np.arange(width), low[1] + resolution * np.arange(height)
-
-
-def _check_positive(numbers: Mapping[str, float | None]) -> None:
-    for name, value in numbers.items():
-        if value is not None and not 0 < value < np.inf:
-            raise TerrainLoopError(
-                expected=f"a positive {name}", found=f"{value}", mend="leave it out to have it derived"
-            )
+    return (float(corner[0]), float(corner[1])), (height, width)
 
 
 def _values(parameters: Hyperparameters) -> list[float]:

@@ -122,11 +122,24 @@ def _one_a_point(values: ArrayLike, count: int) -> Array:
 def _usable_rows(points: Array) -> tuple[NDArray[np.intp], list[str]]:
     """Rows to keep, in order, and what was wrong with the others."""
     finite = np.flatnonzero((np.abs(points) < _FARTHEST).all(axis=1))  # False for NaN too
-    order = finite[np.lexsort(points[finite].T)]
-    repeats = order[1:][(np.diff(points[order], axis=0) == 0).all(axis=1)]
+    repeats = _repeats(points, finite)
     counts = {"not finite": len(points) - len(finite), "an exact repeat of another": len(repeats)}
     repairs = [f"dropped {n} of {len(points)} points: {what}" for what, n in counts.items() if n]
     return np.setdiff1d(finite, repeats, assume_unique=True), repairs
+
+
+def _repeats(points: Array, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Those of the rows that hold the same numbers as one before."""
+    x, y, z = points[rows].T
+    key = x + np.sqrt(2.0) * y + np.sqrt(3.0) * z  # the same for equal rows
+    order = np.argsort(key)
+    tied = np.zeros(len(rows), dtype=bool)
+    same = np.diff(key[order]) == 0
+    tied[1:] |= same
+    tied[:-1] |= same
+    suspects = np.sort(rows[order[tied]])
+    suspects = suspects[np.lexsort(points[suspects].T)]
+    return suspects[1:][(np.diff(points[suspects], axis=0) == 0).all(axis=1)]
 
 
 def _check_count(points: Array, repairs: list[str]) -> None:

@@ -47,4 +47,14 @@ void predict_grid(const Points& points, const Hyperparameters& parameters, const
 void predict_at(const Points& points, const Hyperparameters& parameters, const double* queries,
                 std::size_t count, const Maps& maps, int threads = 1);
 
+/// How the noise of a cloud varies over the ground: each point's as a share of the typical one.
+///
+/// In square cells of side `cell` (metres; half a length scale, so that the ground in one is near a plane)
+/// the robust scatter about a plane is taken and pooled with that of the cells around; where it grows, as
+/// that of stereo does with the range, so does the ratio. Points further from their cell's plane than three
+/// standard deviations have it raised by the square of the excess, so that flying pixels raise no spikes. All
+/// ones where the points are too sparse to tell. `ratio` is (count).
+void noise_ratio(const double* xy, const double* elevation, std::size_t count, double cell, double* ratio,
+                 int threads = 1);
+
 }  // namespace terrainloop::gp

@@ -31,7 +31,8 @@ Sample sample_at(int cell, double t, int index) {
   return sample;
 }
 
-void evaluate_mean(const RowMatrix& weights, double spacing, Span rows, Span cols, const Maps& maps, int stride) {
+void evaluate_mean(const RowMatrix& weights, double spacing, Span rows, Span cols, const Maps& maps,
+                   int stride) {
   if (cols.begin() == cols.end()) return;
   const int first = cols.begin()->cell, count = (cols.end() - 1)->cell - first + kSupport;
   Eigen::RowVectorXd value(count), slope(count);

@@ -26,13 +26,15 @@ struct Span {
 };
 
 /// Elevation and gradient of a spline with the given weights at all rows x cols.
-void evaluate_mean(const RowMatrix& weights, double spacing, Span rows, Span cols, const Maps& maps, int stride);
+void evaluate_mean(const RowMatrix& weights, double spacing, Span rows, Span cols, const Maps& maps,
+                   int stride);
 
 /// Variances of the spline on the cells of a subdomain.
 class VarianceField {
  public:
   /// From what Subdomain::factorise gives; no variance is given as less than `smallest`, metres squared.
-  VarianceField(const Eigen::MatrixXf& covariance, const Subdomain& subdomain, double spacing, double smallest);
+  VarianceField(const Eigen::MatrixXf& covariance, const Subdomain& subdomain, double spacing,
+                double smallest);
   void evaluate(Span rows, Span cols, const Maps& maps, int stride) const;
 
  private:

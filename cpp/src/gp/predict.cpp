@@ -13,11 +13,11 @@
 namespace terrainloop::gp {
 namespace {
 
-constexpr int kReach = 14;            // cells (7 length scales) from the nearest point to where only the prior is left
-constexpr int kWindow = 320;          // cells along an axis that are solved at once, which bounds memory ...
-constexpr int kHalo = 24;             // ... and cells around them, so that the solutions agree at the seams
-constexpr int kMargins[] = {4, 7};    // knots by which subdomains overlap, and where that does not converge
-constexpr double kRounding = 1e-12;   // smallest variance, as a share of the prior's
+constexpr int kReach = 14;  // cells (7 length scales) from the nearest point to where only the prior is left
+constexpr int kWindow = 320;         // cells along an axis that are solved at once, which bounds memory ...
+constexpr int kHalo = 24;            // ... and cells around them, so that the solutions agree at the seams
+constexpr int kMargins[] = {4, 7};   // knots by which subdomains overlap, and where that does not converge
+constexpr double kRounding = 1e-12;  // smallest variance, as a share of the prior's
 
 struct Box {
   double low = std::numeric_limits<double>::infinity(), high = -low;
@@ -160,7 +160,8 @@ void predict(const Points& points, const Hyperparameters& parameters, const Box 
                             row.high - row.low, col.high - col.low};
       const BinnedPoints binned = bin(points, lattice);
       if (!binned.points.empty())
-        WindowSolver(binned, lattice, parameters.variance, workers).predict(places_of(whole, row, col), maps, stride);
+        WindowSolver(binned, lattice, parameters.variance, workers)
+            .predict(places_of(whole, row, col), maps, stride);
     }
 }
 
@@ -197,8 +198,10 @@ struct Place {
 void predict_grid(const Points& points, const Hyperparameters& parameters, const Grid& grid, const Maps& maps,
                   int threads) {
   check(points, parameters, threads);
-  if (!(grid.resolution > 0.0) || grid.rows < 0 || grid.cols < 0)
-    throw std::invalid_argument("the grid must have a positive resolution and no negative size");
+  if (!std::isfinite(grid.x + grid.y + grid.resolution) || !(grid.resolution > 0.0) || grid.rows < 0 ||
+      grid.cols < 0)
+    throw std::invalid_argument(
+        "the grid must have a finite origin, a positive resolution and no negative size");
   if (grid.rows == 0 || grid.cols == 0) return;
   const Box queries[2] = {{grid.x, grid.x + grid.resolution * (grid.cols - 1)},
                           {grid.y, grid.y + grid.resolution * (grid.rows - 1)}};
@@ -211,8 +214,8 @@ void predict_grid(const Points& points, const Hyperparameters& parameters, const
       if (on_rows.begin() != on_rows.end() && on_cols.begin() != on_cols.end()) visit(on_rows, on_cols);
     };
   };
-  predict(points, parameters, queries, static_cast<std::size_t>(grid.rows) * grid.cols, places_of, maps, grid.cols,
-          threads);
+  predict(points, parameters, queries, static_cast<std::size_t>(grid.rows) * grid.cols, places_of, maps,
+          grid.cols, threads);
 }
 
 void predict_at(const Points& points, const Hyperparameters& parameters, const double* queries,
@@ -227,9 +230,11 @@ void predict_at(const Points& points, const Hyperparameters& parameters, const d
   const auto places_of = [=](const Lattice& whole, const Window& row, const Window& col) -> Places {
     std::vector<Place> places;
     for (std::size_t i = 0; i < count; ++i) {
-      const double u = (queries[2 * i] - whole.x) / whole.spacing, v = (queries[2 * i + 1] - whole.y) / whole.spacing;
+      const double u = (queries[2 * i] - whole.x) / whole.spacing,
+                   v = (queries[2 * i + 1] - whole.y) / whole.spacing;
       if (u < 0.0 || v < 0.0 || u > whole.cols || v > whole.rows) continue;
-      const int r = std::min(static_cast<int>(v), whole.rows - 1), c = std::min(static_cast<int>(u), whole.cols - 1);
+      const int r = std::min(static_cast<int>(v), whole.rows - 1),
+                c = std::min(static_cast<int>(u), whole.cols - 1);
       if (r >= row.first && r < row.last && c >= col.first && c < col.last)
         places.push_back({r - row.low, c - col.low, v - r, u - c, static_cast<int>(i)});
     }
@@ -239,9 +244,11 @@ void predict_at(const Points& points, const Hyperparameters& parameters, const d
     std::sort(places.begin(), places.end(), before);
     return [places = std::move(places), before](const CellRange& cells, const Visit& visit) {
       for (int r = cells.first_row; r < cells.last_row; ++r)
-        for (auto place = std::lower_bound(places.begin(), places.end(), Place{r, cells.first_col, 0, 0, 0}, before);
+        for (auto place =
+                 std::lower_bound(places.begin(), places.end(), Place{r, cells.first_col, 0, 0, 0}, before);
              place != places.end() && place->row == r && place->col < cells.last_col; ++place) {
-          const Sample on_row = sample_at(r, place->v, 0), on_col = sample_at(place->col, place->u, place->index);
+          const Sample on_row = sample_at(r, place->v, 0),
+                       on_col = sample_at(place->col, place->u, place->index);
           visit({&on_row, &on_row + 1}, {&on_col, &on_col + 1});
         }
     };

@@ -39,7 +39,8 @@ std::vector<double> weight_covariance(int count) {
 }
 
 Matrix toeplitz(const std::vector<double>& row, int size) {
-  return Matrix::NullaryExpr(size, size, [&](Eigen::Index i, Eigen::Index j) { return row[std::abs(i - j)]; });
+  return Matrix::NullaryExpr(size, size,
+                             [&](Eigen::Index i, Eigen::Index j) { return row[std::abs(i - j)]; });
 }
 
 Matrix inverse(const Matrix& matrix) {

@@ -7,7 +7,8 @@ namespace terrainloop::gp {
 namespace {
 
 constexpr int kMaxSteps = 40;
-constexpr double kTolerance = 5e-4;  // a correction, as a share of the solution; the error left is far smaller
+constexpr double kTolerance =
+    5e-4;  // a correction, as a share of the solution; the error left is far smaller
 
 /// Size of what the weights say about the slopes.
 double roughness(const RowMatrix& w) {
@@ -15,7 +16,8 @@ double roughness(const RowMatrix& w) {
                    (w.bottomRows(w.rows() - 1) - w.topRows(w.rows() - 1)).squaredNorm());
 }
 
-RowMatrix precondition(const std::vector<Subdomain>& subdomains, const RowMatrix& residual, Workers& workers) {
+RowMatrix precondition(const std::vector<Subdomain>& subdomains, const RowMatrix& residual,
+                       Workers& workers) {
   std::vector<RowMatrix> parts(subdomains.size());
   workers.run(static_cast<int>(parts.size()), [&](int i) { parts[i] = subdomains[i].solve(residual); });
   RowMatrix sum = RowMatrix::Zero(residual.rows(), residual.cols());
@@ -25,7 +27,8 @@ RowMatrix precondition(const std::vector<Subdomain>& subdomains, const RowMatrix
   return sum;
 }
 
-RowMatrix product(const Information& information, const Precision& precision, const RowMatrix& w, Workers& workers) {
+RowMatrix product(const Information& information, const Precision& precision, const RowMatrix& w,
+                  Workers& workers) {
   RowMatrix out = precision.rows * w * precision.cols / precision.variance;
   information.add_product(w, out, workers);
   return out;

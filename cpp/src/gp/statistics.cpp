@@ -26,14 +26,14 @@ void pair_products(const BasisRow& basis, double scale, PairProducts& products) 
   double twice[2 * kSupport];
   for (int a = 0; a < kSupport; ++a) twice[a] = twice[a + kSupport] = basis[a];
   for (int turn = 0; turn < kTurns; ++turn)
-    for (int a = 0; a < kSupport; ++a)
-      products[kSupport * turn + a] = scale * basis[a] * twice[a + turn];
+    for (int a = 0; a < kSupport; ++a) products[kSupport * turn + a] = scale * basis[a] * twice[a + turn];
 }
 
 struct Pair {
   int entry, first, offset;
 };
 
+/// Each pair once.
 constexpr std::array<Pair, kPairs> list_pairs() {
   std::array<Pair, kPairs> pairs{};
   int count = 0;
@@ -46,6 +46,18 @@ constexpr std::array<Pair, kPairs> list_pairs() {
 }
 
 constexpr std::array<Pair, kPairs> kPairList = list_pairs();
+
+/// Adds pair products to the places of their offsets, which lie `stride` apart (the compiler unrolls it).
+template <int turn = 0>
+void add_turns(const double* products, double* entries, int stride) {
+  if constexpr (turn < kTurns) {
+    for (int a = 0; a < kSupport - turn; ++a) entries[turn * stride + a] += products[kSupport * turn + a];
+    if constexpr (turn > 0 && 2 * turn < kSupport)
+      for (int a = 0; a < turn; ++a)
+        entries[(kSupport - turn) * stride + a] += products[kSupport * (turn + 1) - turn + a];
+    add_turns<turn + 1>(products, entries, stride);
+  }
+}
 
 }  // namespace
 
@@ -76,7 +88,7 @@ BinnedPoints bin(const Points& points, const Lattice& lattice) {
 
 Information::Information(const BinnedPoints& binned, const Lattice& lattice, Workers& workers)
     : cols_(lattice.knot_cols()),
-      matrix_(static_cast<std::size_t>(lattice.knot_rows()) * cols_ * kStencil, 0.0),
+      matrix_(static_cast<std::size_t>(lattice.knot_rows()) * kSupport * kSupport * cols_, 0.0),
       vector_(RowMatrix::Zero(lattice.knot_rows(), cols_)) {
   striped(workers, lattice.rows, [&](int row) {
     for (int col = 0; col < lattice.cols; ++col) {
@@ -110,31 +122,27 @@ void Information::add_cell(int row, int col, const CellPoint* begin, const CellP
   }
   for (int b = 0; b < kSupport; ++b)
     for (int a = 0; a < kSupport; ++a) vector_(row + b, col + a) += vector(a, b);
-  for (int pair = 0; pair < kPairs; ++pair) {
-    double* out = &matrix_[kStencil * (static_cast<std::size_t>(row + kPairList[pair].first) * cols_ + col) +
-                           kSupport * kPairList[pair].offset];
-    for (const Pair& in_x : kPairList) out[kStencil * in_x.first + in_x.offset] += sums[pair][in_x.entry];
-  }
+  for (int pair = 0; pair < kPairs; ++pair)
+    add_turns(sums[pair].data(),
+              &matrix_[index(row + kPairList[pair].first, kPairList[pair].offset, 0) + col], cols_);
 }
 
 void Information::add_product(const RowMatrix& w, RowMatrix& out, Workers& workers) const {
   const int rows = static_cast<int>(w.rows());
+  using Row = Eigen::Map<const Eigen::ArrayXd>;
   striped(workers, rows, [&](int row) {
-    for (int db = 0; db < std::min(kSupport, rows - row); ++db)
-      for (int col = 0; col < cols_; ++col) {
-        const double* entry = at(row, col) + kSupport * db;
-        const int reach = std::min(kSupport, cols_ - col);
-        const double *above = &w(row, col), *below = &w(row + db, col);
-        double *out_above = &out(row, col), *out_below = &out(row + db, col);
-        double sum_above = 0.0, sum_below = 0.0;
-        for (int da = 0; da < reach; ++da) sum_above += entry[da] * below[da];
-        if (db > 0) {
-          for (int da = 0; da < reach; ++da) sum_below += entry[da] * above[da];
-          for (int da = 1; da < reach; ++da) out_above[da] += entry[da] * below[0];
-        }
-        for (int da = 1; da < reach; ++da) out_below[da] += entry[da] * above[0];
-        out_above[0] += sum_above;
-        out_below[0] += sum_below;
+    const auto along = [&](const double* entries, const double* from, double* to, Eigen::Index count) {
+      Eigen::Map<Eigen::ArrayXd>(to, count) += Row(entries, count) * Row(from, count);
+    };
+    for (int below = 0; below < std::min(kSupport, rows - row); ++below)
+      for (int right = 0; right < std::min(kSupport, cols_); ++right) {
+        const double* entries = at(row, below, right);
+        const Eigen::Index count = cols_ - right;
+        along(entries, &w(row + below, right), &out(row, 0), count);
+        if (below > 0 || right > 0) along(entries, &w(row, 0), &out(row + below, right), count);
+        if (below == 0 || right == 0) continue;
+        along(entries, &w(row, right), &out(row + below, 0), count);
+        along(entries, &w(row + below, 0), &out(row, right), count);
       }
   });
 }

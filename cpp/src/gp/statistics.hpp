@@ -48,15 +48,19 @@ class Information {
  public:
   Information(const BinnedPoints& binned, const Lattice& lattice, Workers& workers);
 
-  /// 8 x 8 entries over (row offset, column offset) of the pair that begins at the knot.
-  const double* at(int row, int col) const { return &matrix_[kStencil * (std::size_t{static_cast<std::size_t>(row)} * cols_ + col)]; }
+  /// Entries of the pairs that begin at the knots of a row and have these offsets, by column.
+  const double* at(int row, int row_offset, int col_offset) const {
+    return &matrix_[index(row, row_offset, col_offset)];
+  }
   /// Phi' W z, (knot rows, knot cols).
   const RowMatrix& vector() const { return vector_; }
   /// out += Phi' W Phi w.
   void add_product(const RowMatrix& w, RowMatrix& out, Workers& workers) const;
 
  private:
-  static constexpr int kStencil = kSupport * kSupport;
+  std::size_t index(int row, int row_offset, int col_offset) const {
+    return ((static_cast<std::size_t>(row) * kSupport + row_offset) * kSupport + col_offset) * cols_;
+  }
   void add_cell(int row, int col, const CellPoint* begin, const CellPoint* end);
 
   int cols_;

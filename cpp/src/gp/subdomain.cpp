@@ -4,12 +4,14 @@
 #include <cmath>
 #include <stdexcept>
 
+#include "triangular.hpp"
+
 namespace terrainloop::gp {
 namespace {
 
-constexpr int kCells = 10;        // a subdomain answers for, along each axis
-constexpr double kPinning = 0.1;  // weight of the whole axis' precision against the interval's own
-constexpr int kBlock = 64;        // columns at a time, so that a product's operands stay in cache
+constexpr int kCells = 10;          // a subdomain answers for, along each axis
+constexpr double kSingular = 1e-6;  // least pivot of a factor, as a share of the greatest
+constexpr double kPinning = 0.1;    // weight of the whole axis' precision against the interval's own
 
 /// Weights that fall smoothly from one to zero over the knots two intervals share.
 Eigen::VectorXd window(const Interval& interval, int knots, int margin) {
@@ -22,38 +24,10 @@ Eigen::VectorXd window(const Interval& interval, int knots, int margin) {
   });
 }
 
-/// In place, the inverse of a lower triangular matrix whose upper triangle is zero.
-void invert_lower(Eigen::Ref<Eigen::MatrixXf> lower) {
-  const Eigen::Index n = lower.rows();
-  if (n <= 32) {
-    Eigen::MatrixXf result = Eigen::MatrixXf::Identity(n, n);
-    lower.triangularView<Eigen::Lower>().solveInPlace(result);
-    lower = result;
-    return;
-  }
-  const Eigen::Index half = (n / 2 + 7) / 8 * 8;
-  auto corner = lower.bottomLeftCorner(n - half, half);
-  invert_lower(lower.topLeftCorner(half, half));
-  invert_lower(lower.bottomRightCorner(n - half, n - half));
-  const Eigen::MatrixXf inner = corner * lower.topLeftCorner(half, half).triangularView<Eigen::Lower>();
-  corner.noalias() = -(lower.bottomRightCorner(n - half, n - half) * inner);
-}
-
-/// Lower triangle of V' V for a lower triangular V.
-Eigen::MatrixXf square(const Eigen::MatrixXf& v) {
-  const Eigen::Index n = v.rows();
-  Eigen::MatrixXf result(n, n);
-  for (Eigen::Index i = 0; i < n; i += kBlock) {
-    const Eigen::Index width = std::min<Eigen::Index>(kBlock, n - i);
-    result.block(i, 0, width, i + width).noalias() =
-        v.block(i, i, n - i, width).transpose() * v.block(i, 0, n - i, i + width);
-  }
-  return result;
-}
-
 }  // namespace
 
-std::vector<Interval> cut(int cells, int margin, const std::vector<double>& covariance, const Matrix& precision) {
+std::vector<Interval> cut(int cells, int margin, const std::vector<double>& covariance,
+                          const Matrix& precision) {
   const int count = (cells + kCells - 1) / kCells, knots = cells + kDegree;
   std::vector<Interval> intervals(count);
   Eigen::VectorXd total = Eigen::VectorXd::Zero(knots);
@@ -68,9 +42,9 @@ std::vector<Interval> cut(int cells, int margin, const std::vector<double>& cova
     interval.share = window(interval, knots, margin);
     total.segment(interval.first_knot, interval.knots()) += interval.share;
     if (own.rows() != interval.knots()) own = inverse(toeplitz(covariance, interval.knots()));
-    interval.precision = (1.0 - kPinning) * own +
-                         kPinning * precision.block(interval.first_knot, interval.first_knot, interval.knots(),
-                                                    interval.knots());
+    interval.precision =
+        (1.0 - kPinning) * own + kPinning * precision.block(interval.first_knot, interval.first_knot,
+                                                            interval.knots(), interval.knots());
   }
   for (Interval& interval : intervals)
     interval.share.array() /= total.segment(interval.first_knot, interval.knots()).array();
@@ -79,12 +53,14 @@ std::vector<Interval> cut(int cells, int margin, const std::vector<double>& cova
 
 PackedFactor::PackedFactor(const Matrix& lower) : size_(static_cast<int>(lower.rows())) {
   std::size_t count = 0;
-  for (int first = 0; first < size_; first += kPanel) count += (size_ - first) * std::min(kPanel, size_ - first);
+  for (int first = 0; first < size_; first += kPanel)
+    count += (size_ - first) * std::min(kPanel, size_ - first);
   values_.resize(count);
   float* values = values_.data();
   for (int first = 0; first < size_; first += kPanel) {
     const int width = std::min(kPanel, size_ - first), height = size_ - first;
-    Eigen::Map<Eigen::MatrixXf>(values, height, width) = lower.block(first, first, height, width).cast<float>();
+    Eigen::Map<Eigen::MatrixXf>(values, height, width) =
+        lower.block(first, first, height, width).cast<float>();
     values += static_cast<std::ptrdiff_t>(height) * width;
   }
 }
@@ -128,11 +104,10 @@ void Subdomain::assemble(const Information& information, double variance, Matrix
   for (int i = 0; i < rows; ++i)
     for (int j = i; j < rows; ++j) {
       pair = rows_->precision(j, i) / variance * cols_->precision;
-      for (int a = 0; a < cols && j - i < kSupport; ++a) {
-        const double* entry = information.at(rows_->first_knot + i, cols_->first_knot + a) + kSupport * (j - i);
-        const int reach = std::min(kSupport, cols - a);
-        for (int b = 0; b < reach; ++b) pair(a + b, a) += entry[b];
-        for (int b = 1; b < reach; ++b) pair(a, a + b) += entry[b];
+      for (int right = 0; right < std::min(kSupport, cols) && j - i < kSupport; ++right) {
+        const double* entries = information.at(rows_->first_knot + i, j - i, right) + cols_->first_knot;
+        for (int a = 0; a < cols - right; ++a) pair(a + right, a) += entries[a];
+        for (int a = 0; a < cols - right && right > 0; ++a) pair(a, a + right) += entries[a];
       }
       const int *at_i = &position_[i * cols], *at_j = &position_[j * cols];
       for (int a = 0; a < cols; ++a) {
@@ -146,14 +121,15 @@ void Subdomain::factorise(const Information& information, double variance, Eigen
   Matrix lower;
   assemble(information, variance, lower);
   const Eigen::LLT<Eigen::Ref<Matrix>> factor(lower);
-  if (factor.info() != Eigen::Success || !lower.diagonal().allFinite())
+  const auto pivots = lower.diagonal();
+  if (factor.info() != Eigen::Success || !(pivots.minCoeff() > kSingular * pivots.maxCoeff()))
     throw std::runtime_error("the equations of a subdomain are not positive definite");
   factor_ = PackedFactor(lower);
   if (covariance == nullptr) return;
   const int core = (rows_->cells() + kDegree) * (cols_->cells() + kDegree);
   Eigen::MatrixXf inverse = lower.bottomRightCorner(core, core).cast<float>().triangularView<Eigen::Lower>();
-  invert_lower(inverse);
-  *covariance = square(inverse);
+  invert_lower<float>(inverse);
+  *covariance = square<float>(inverse);
 }
 
 RowMatrix Subdomain::solve(const RowMatrix& rhs) const {
@@ -161,7 +137,8 @@ RowMatrix Subdomain::solve(const RowMatrix& rhs) const {
   Eigen::VectorXf x(rows * cols);
   for (int row = 0; row < rows; ++row)
     for (int col = 0; col < cols; ++col)
-      x[position_[row * cols + col]] = static_cast<float>(rhs(rows_->first_knot + row, cols_->first_knot + col));
+      x[position_[row * cols + col]] =
+          static_cast<float>(rhs(rows_->first_knot + row, cols_->first_knot + col));
   factor_.solve(x);
   RowMatrix solution(rows, cols);
   for (int row = 0; row < rows; ++row)

@@ -25,7 +25,8 @@ struct Interval {
 /// `covariance` and `precision` are the prior of the whole axis. Knots beyond an interval are held at zero
 /// by its rows of `precision` alone; most of the way the interval takes the inverse of its own covariance
 /// instead, which leaves them free: that halves the error of its variance.
-std::vector<Interval> cut(int cells, int margin, const std::vector<double>& covariance, const Matrix& precision);
+std::vector<Interval> cut(int cells, int margin, const std::vector<double>& covariance,
+                          const Matrix& precision);
 
 /// Lower Cholesky factor in single precision, as panels of columns, the upper triangle left out.
 class PackedFactor {

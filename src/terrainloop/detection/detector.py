@@ -8,7 +8,7 @@ from functools import partial
 from terrainloop.config import Settings
 from terrainloop.errors import TerrainLoopError
 from terrainloop.features import Features
-from terrainloop.gp.hyperparameters import BLOCK_POINTS, fit_hyperparameters
+from terrainloop.gp.hyperparameters import fit_hyperparameters
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
@@ -126,7 +126,7 @@ def fit_database(submaps: Sequence[Submap], settings: Settings, *, workers: int 
         length_scale=settings.map.length_scale,
         noise=settings.map.noise,
         max_points=settings.map.max_points,
-        block_points=BLOCK_POINTS if settings.map.fit == "database" else None,
+        exact=settings.map.solver == "exact",
         remove_plane=settings.map.remove_plane,
         seed=settings.seed,
         workers=workers,
@@ -156,6 +156,8 @@ def map_submap(
         settings.map.resolution,
         max_points=settings.map.max_points,
         remove_plane=settings.map.remove_plane,
+        local_noise=settings.map.local_noise,
+        solver=settings.map.solver,
         max_variance_ratio=settings.map.max_variance_ratio,
         seed=settings.seed,
         workers=workers,

@@ -1,6 +1,7 @@
 """The Gaussian process solved exactly, in float64: the paper's method and the reference for any other.
 
-With training points X, elevations z and A = [K(X, X) + noise^2 I]^-1, at a query x:
+With training points X, elevations z and A = [K(X, X) + N]^-1, N the diagonal of the points' noise
+squared, at a query x:
 
     elevation       k(x, X) A z                                (paper, eq. 2)
     variance        k(x, x) - k(x, X) A k(X, x)                (paper, eq. 3)
@@ -9,7 +10,6 @@ With training points X, elevations z and A = [K(X, X) + noise^2 I]^-1, at a quer
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -21,30 +21,18 @@ from threadpoolctl import threadpool_limits
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.kernel import Array, Hyperparameters, factor, squared_distances
+from terrainloop.gp.prediction import Prediction
 
 REACH = 7.0  # length scales beyond which the kernel, below 3e-11, no longer counts
 TILE = 6.0  # side of the tiles the variance is computed in, length scales
 NODES = 30  # along an axis of a tile: they interpolate the kernel to 1e-11
 MAX_TILE = 64  # pixels along an axis of a tile, which bounds memory
 ROUNDING = 1e-12
+MAX_POINTS = 20_000  # 3.2 GB a matrix
 
 
-@dataclass(frozen=True, eq=False)
-class GridPrediction:
-    """Posterior on a grid, each (rows = y, columns = x), float64.
-
-    `gradient_variance` is the mean of the variances of the two gradient components.
-    """
-
-    elevation: Array
-    gradient_x: Array
-    gradient_y: Array
-    variance: Array
-    gradient_variance: Array
-
-
-def factorise(xy: Array, parameters: Hyperparameters) -> Array:
-    """Lower Cholesky factor (N, N) of K(X, X) + noise^2 I.
+def factorise(xy: Array, parameters: Hyperparameters, relative_noise: Array | float = 1.0) -> Array:
+    """Lower Cholesky factor (N, N) of K(X, X) + N, each point's noise being its share (N,) of the typical.
 
     Raises
     ------
@@ -55,7 +43,7 @@ def factorise(xy: Array, parameters: Hyperparameters) -> Array:
     covariance *= -0.5 / parameters.length_scale**2
     np.exp(covariance, out=covariance)
     covariance *= parameters.variance
-    covariance.flat[:: len(xy) + 1] += parameters.noise**2
+    covariance.flat[:: len(xy) + 1] += (parameters.noise * relative_noise) ** 2
     try:
         # The transpose of a symmetric matrix is itself, and LAPACK then works in place.
         return cholesky(covariance.T, lower=True, overwrite_a=True, check_finite=False)
@@ -75,8 +63,15 @@ def invert(cholesky_factor: Array) -> Array:
 
 
 def predict_grid(
-    xy: Array, elevation: Array, parameters: Hyperparameters, x: Array, y: Array, *, workers: int = 1
-) -> GridPrediction:
+    xy: Array,
+    elevation: Array,
+    parameters: Hyperparameters,
+    x: Array,
+    y: Array,
+    *,
+    relative_noise: Array | float = 1.0,
+    workers: int = 1,
+) -> Prediction:
     """Posterior of the elevation and its gradient on the grid spanned by `x` and `y`.
 
     Parameters
@@ -88,21 +83,29 @@ def predict_grid(
     parameters : Hyperparameters
     x, y : array, (W,) and (H,)
         Grid coordinates, metres.
+    relative_noise : array, (N,)
+        Noise of each point as a share of ``parameters.noise``.
     workers : int
         Threads; the result does not depend on it.
 
     Returns
     -------
-    GridPrediction
-        Arrays of shape (H, W).
+    Prediction
+        Arrays of shape (H, W), float64.
 
     Raises
     ------
     TerrainLoopError
-        If the covariance cannot be factorised.
+        If the covariance cannot be factorised, or there are more points than fit into memory.
     """
+    if len(xy) > MAX_POINTS:
+        raise TerrainLoopError(
+            expected=f"at most {MAX_POINTS} points for the exact solver",
+            found=f"{len(xy)}, {8e-9 * len(xy) ** 2:.0f} GB a matrix",
+            mend="set max_points, or leave the solver at 'spline', which takes them all",
+        )
     with threadpool_limits(1, user_api="blas"):  # BLAS sums in another order with more threads
-        lower = factorise(xy, parameters)
+        lower = factorise(xy, parameters, relative_noise)
         weights = parameters.variance * cho_solve((lower, True), elevation, check_finite=False)
         kx, dkx = factor(x, xy[:, 0], parameters.length_scale)
         ky, dky = factor(y, xy[:, 1], parameters.length_scale)
@@ -110,7 +113,7 @@ def predict_grid(
         gradient_y = (dky * weights) @ kx.T
         del kx, dkx, ky, dky
         variance, gradient_variance = _variances(xy, invert(lower), parameters, x, y, workers)
-    return GridPrediction(mean, gradient_x, gradient_y, variance, gradient_variance)
+    return Prediction(mean, gradient_x, gradient_y, variance, gradient_variance)
 
 
 def _variances(

@@ -1,33 +1,47 @@
 """Length scale, variance and noise by maximum likelihood (Rasmussen & Williams 2006, ch. 5)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import astuple
 from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import cho_solve
-from scipy.optimize import minimize
+from scipy.optimize import Bounds, minimize
 from threadpoolctl import threadpool_limits
 
+from terrainloop import _core
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.exact import factorise, invert
 from terrainloop.gp.kernel import Array, Hyperparameters, squared_distances
 from terrainloop.gp.surface import Surface, surface_of
 from terrainloop.submap import Submap
 
-BLOCK_POINTS = 600
-
 # How far each hyperparameter may move from its start, as a factor. A length scale far below the
 # spacing of the points would only turn the terrain into noise.
 SPAN = {"length_scale": 10.0, "variance": 1e3, "noise": 1e3}
 
+# Of the blocks of a search: their side in length scales, and the sum of r^3 over their ranks r. The first
+# finds about where the length scale lies; the larger the blocks, the nearer to the likelihood of all points.
+SEARCHES = ((4.0, 3e7), (10.0, 1e9))
+ROUNDS = 6
+REACH = (1 / 1.5, 3.0)  # factors of the length scale that blocks are good for
+CLOSE = 1.25  # factor of the length scale within which they are at their best
+STANDARD_ERRORS = 0.3  # from the optimum, where a search ends
 
-def negative_log_likelihood(log_parameters: Array, xy: Array, elevation: Array) -> tuple[float, Array]:
+WALL = 1e25  # turns a line search back
+
+Likelihood = Callable[[float, float, float], tuple[float, tuple[float, float, float]]]
+
+
+def negative_log_likelihood(
+    log_parameters: Array, xy: Array, elevation: Array, relative_noise: Array | float = 1.0
+) -> tuple[float, Array]:
     """-log p(z | X) and its gradient with respect to the logarithms of the hyperparameters.
 
-    With a = [K + noise^2 I]^-1 z, the derivative along any parameter t is
-    -1/2 tr((a a' - [K + noise^2 I]^-1) dK/dt) (Rasmussen & Williams, eq. 5.9).
+    With C = K + N the covariance of the elevations (see `exact`) and a = C^-1 z, the derivative along
+    any parameter t is -1/2 tr((a a' - C^-1) dC/dt) (Rasmussen & Williams, eq. 5.9).
 
     Parameters
     ----------
@@ -35,13 +49,16 @@ def negative_log_likelihood(log_parameters: Array, xy: Array, elevation: Array) 
         Logarithms of length scale, variance and noise.
     xy, elevation : array, (N, 2) and (N,)
         Training data, metres.
+    relative_noise : array, (N,), or float
+        Noise of each point as a share of the typical one.
     """
     parameters = Hyperparameters(*np.exp(log_parameters).tolist())
-    lower = factorise(xy, parameters)
+    lower = factorise(xy, parameters, relative_noise)
     weights = cho_solve((lower, True), elevation, check_finite=False)
     value = 0.5 * elevation @ weights + np.log(lower.diagonal()).sum() + 0.5 * len(xy) * np.log(2 * np.pi)
     sensitivity = invert(lower)
-    by_noise = parameters.noise**2 * (np.trace(sensitivity) - weights @ weights)
+    noise_variance = np.broadcast_to((parameters.noise * relative_noise) ** 2, len(xy))
+    by_noise = noise_variance @ (sensitivity.diagonal() - weights**2)
     sensitivity -= np.multiply.outer(weights, weights)
     scaled = squared_distances(xy)
     scaled /= parameters.length_scale**2
@@ -57,8 +74,8 @@ def fit_hyperparameters(
     variance: float | None = None,
     noise: float | None = None,
     *,
-    max_points: int = 5000,
-    block_points: int | None = BLOCK_POINTS,
+    max_points: int | None = None,
+    exact: bool = False,
     remove_plane: bool = True,
     seed: int = 0,
     workers: int = 1,
@@ -71,12 +88,12 @@ def fit_hyperparameters(
         Gravity-aligned points, metres.
     length_scale, variance, noise : float, optional
         Where the search begins: metres, metres squared (default: the elevations' own), metres.
-    max_points : int
-        Drawn at random from each cloud. Fit on as many as the maps are made of: thinner data ask
-        for a longer length scale.
-    block_points : int, optional
-        The likelihood is that of neighbouring blocks of at most so many points, taken as independent,
-        which costs a hundredth of the exact one; None: exact, all points of a cloud at once.
+    max_points : int, optional
+        Drawn at random from each cloud; all if not given. Fit on as many as the maps are made of:
+        thinner data ask for a longer length scale.
+    exact : bool
+        By the likelihood of all points of a cloud at once, which takes minutes for 5000 of them; if not,
+        by that of square blocks, from any number of points (see `fit_blocks`).
     remove_plane : bool
         Take the best plane out of each cloud first.
     seed : int
@@ -100,15 +117,18 @@ def fit_hyperparameters(
         surface_of(cloud, max_points=max_points, remove_plane=remove_plane, seed=seed) for cloud in clouds
     ]
     start = surfaces[0].start(length_scale, variance, noise)
-    if block_points is not None:
-        surfaces = [block for surface in surfaces for block in surface.blocks(block_points)]
-    return maximise_likelihood(surfaces, start, workers=workers)
+    fit = maximise_likelihood if exact else fit_blocks
+    return fit(surfaces, start, workers=workers)
 
 
-def maximise_likelihood(
+def fit_blocks(
     surfaces: Sequence[Surface], start: Hyperparameters, *, fixed: Sequence[str] = (), workers: int = 1
 ) -> Hyperparameters:
-    """Most likely hyperparameters by L-BFGS-B over their logarithms.
+    """Most likely hyperparameters from every point, square blocks of ground being taken as independent.
+
+    On a block the prior is held by its principal components, so that the likelihood costs the same for any
+    number of points. Blocks and components suit length scales near the one they were made for: a search
+    begins anew until it ends near where it began.
 
     Parameters
     ----------
@@ -121,8 +141,81 @@ def maximise_likelihood(
     workers : int
         Threads; the result does not depend on it.
     """
-    origin = np.log([getattr(start, name) for name in SPAN])
+    data = [(surface.xy, surface.elevation, surface.relative_noise) for surface in surfaces]
+    low, high = _bounds(start, fixed)
+    if "length_scale" not in fixed:
+        high[0] = max(high[0], np.log(max(np.ptp(surface.xy, axis=0).max() for surface in surfaces)))
+    log_parameters = np.log(astuple(start))
+    for side, work in SEARCHES:
+        for _ in range(ROUNDS):
+            begin = log_parameters
+            length_scale, variance, noise = np.exp(begin).tolist()
+            likelihood, blocks, rank, points = _core.gp_block_likelihood(
+                data,
+                length_scale=length_scale,
+                variance=variance,
+                noise=noise,
+                side=side * length_scale,
+                work=work,
+                threads=workers,
+            )
+            lowest, highest = low.copy(), high.copy()
+            lowest[0], highest[0] = np.clip(begin[0] + np.log(REACH), low[0], high[0])
+            # About the standard errors, by the expected curvature.
+            errors = 1 / np.sqrt([2 * blocks * rank, blocks * rank / 4, 2 * points])
+            log_parameters = _descend(likelihood, begin, lowest, highest, errors)
+            moved = log_parameters - begin
+            more_detail = moved[1] - 2 * moved[2]  # of the ratio of variance and noise
+            if abs(moved[0]) < np.log(CLOSE) and more_detail < 1:
+                break
+    return Hyperparameters(*np.exp(log_parameters).tolist())
+
+
+def _descend(likelihood: Likelihood, begin: Array, low: Array, high: Array, errors: Array) -> Array:
+    """Logarithms of the most likely hyperparameters by L-BFGS-B, in steps of standard errors."""
+
+    def in_errors(step: Array) -> tuple[float, Array]:
+        try:
+            value, gradient = likelihood(*np.exp(begin + errors * step).tolist())
+        except RuntimeError:
+            return WALL, np.zeros(3)
+        return value, errors * np.array(gradient)
+
+    result = minimize(
+        in_errors,
+        np.zeros(3),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=Bounds((low - begin) / errors, (high - begin) / errors),
+        options={"ftol": 1e-9, "gtol": STANDARD_ERRORS},
+    )
+    moved: Array = errors * result.x
+    return begin + moved
+
+
+def _bounds(start: Hyperparameters, fixed: Sequence[str]) -> tuple[Array, Array]:
+    """Least and greatest logarithms of the hyperparameters."""
+    origin = np.log(astuple(start))
     span = np.array([0.0 if name in fixed else np.log(factor) for name, factor in SPAN.items()])
+    return origin - span, origin + span
+
+
+def maximise_likelihood(
+    surfaces: Sequence[Surface], start: Hyperparameters, *, fixed: Sequence[str] = (), workers: int = 1
+) -> Hyperparameters:
+    """Most likely hyperparameters by L-BFGS-B over their logarithms, all points being taken at once.
+
+    Parameters
+    ----------
+    surfaces : sequence of Surface
+        Independent draws from one prior.
+    start : Hyperparameters
+        Where the search begins.
+    fixed : sequence of str
+        Names of the hyperparameters that keep their value.
+    workers : int
+        Threads; the result does not depend on it.
+    """
     count = sum(len(surface.xy) for surface in surfaces)
 
     def per_point(log_parameters: Array) -> tuple[float, Array]:
@@ -132,10 +225,10 @@ def maximise_likelihood(
     with ThreadPoolExecutor(workers) as pool, threadpool_limits(1, user_api="blas"):
         result = minimize(
             per_point,
-            origin,
+            np.log(astuple(start)),
             jac=True,
             method="L-BFGS-B",
-            bounds=np.c_[origin - span, origin + span],
+            bounds=Bounds(*_bounds(start, fixed)),
             options={"ftol": 1e-6, "gtol": 1e-3},
         )
     return Hyperparameters(*np.exp(result.x).tolist())
@@ -144,6 +237,6 @@ def maximise_likelihood(
 def _likelihood_or_wall(log_parameters: Array, surface: Surface) -> tuple[float, Array]:
     """The likelihood, or a wall that turns the line search back where the covariance is singular."""
     try:
-        return negative_log_likelihood(log_parameters, surface.xy, surface.elevation)
+        return negative_log_likelihood(log_parameters, surface.xy, surface.elevation, surface.relative_noise)
     except TerrainLoopError:
-        return 1e25, np.zeros(3)
+        return WALL, np.zeros(3)

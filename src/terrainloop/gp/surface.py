@@ -1,10 +1,11 @@
-"""What the Gaussian process sees of a cloud: a few thousand points about a local origin."""
+"""What the Gaussian process sees of a cloud: its points about a local origin, without their plane."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.kernel import Array, Hyperparameters
 from terrainloop.submap import Submap
 
@@ -28,17 +29,34 @@ class Surface:
         Of the points, in the frame of the cloud, metres.
     slope : array, (2,)
         Of the plane that was taken out; zero where none was.
+    relative_noise : array, (N,)
+        Noise of each point as a share of the typical one.
+    typical_noise : float, optional
+        Median of the noise that was given with the points, metres.
     """
 
     xy: Array
     elevation: Array
     centre: Array
     slope: Array
+    relative_noise: Array
+    typical_noise: float | None = None
 
     @property
     def spacing(self) -> float:
         """Typical distance between neighbouring points, metres."""
-        return float(np.sqrt(np.prod(np.ptp(self.xy, axis=0)) / len(self.xy)))
+        low, high = np.percentile(self.xy, [2, 98], axis=0)  # a stray point must not decide
+        return float(np.sqrt(np.prod(high - low) / (0.96**2 * len(self.xy))))
+
+    @property
+    def extent_in_words(self) -> str:
+        """How far the points reach, and most of them."""
+        width, depth = np.ptp(self.xy, axis=0)
+        most = np.diff(np.percentile(self.xy, [1, 99], axis=0), axis=0)[0]
+        return (
+            f"an extent of {width:.0f} x {depth:.0f} m, of which all but a hundredth of the points at each "
+            f"border take {most[0]:.0f} x {most[1]:.0f} m"
+        )
 
     def start(
         self, length_scale: float | None, variance: float | None, noise: float | None
@@ -58,29 +76,69 @@ class Surface:
         axis = int(np.argmax(np.ptp(self.xy, axis=0)))
         order = np.argsort(self.xy[:, axis], kind="stable")
         halves = np.array_split(order, 2)
-        parts = (replace(self, xy=self.xy[half], elevation=self.elevation[half]) for half in halves)
+        parts = (self._take(half) for half in halves)
         return [block for part in parts for block in part.blocks(max_points)]
 
+    def _take(self, rows: NDArray[np.intp]) -> "Surface":
+        parts = {name: getattr(self, name)[rows] for name in ("xy", "elevation", "relative_noise")}
+        return replace(self, **parts)
 
-def surface_of(points: ArrayLike | Submap, *, max_points: int, remove_plane: bool, seed: int) -> Surface:
-    """Draw at most `max_points` of the points (N, 3) at random and refer them to their centre.
+
+def surface_of(
+    points: ArrayLike | Submap,
+    *,
+    max_points: int | None = None,
+    remove_plane: bool = True,
+    noise: Array | None = None,
+    seed: int = 0,
+) -> Surface:
+    """Refer points (N, 3) to their centre, at most `max_points` of them drawn at random.
 
     Raises
     ------
     TerrainLoopError
-        If the points make no submap (see `Submap`).
+        If the points make no submap (see `Submap`), or the noise (N,) is not one number for each.
     """
-    cloud = points.points if isinstance(points, Submap) else Submap(np.asarray(points)).points
-    if len(cloud) > max_points:
-        rng = np.random.default_rng(seed)
-        cloud = cloud[np.sort(rng.choice(len(cloud), max_points, replace=False))]
+    cloud = _checked(points, noise).points
+    if noise is not None:
+        noise = np.asarray(noise, dtype=np.float64)
+    if max_points is not None and len(cloud) > max_points:
+        rows = np.sort(np.random.default_rng(seed).choice(len(cloud), max_points, replace=False))
+        cloud, noise = cloud[rows], None if noise is None else noise[rows]
     centre, slope = cloud.mean(axis=0), np.zeros(2)
     for _ in range(PLANE_FITS if remove_plane else 0):
         local = cloud - centre
-        slope = np.linalg.lstsq(local[:, :2], local[:, 2], rcond=None)[0]
+        slope = np.linalg.lstsq(local[:, :2].T @ local[:, :2], local[:, :2].T @ local[:, 2], rcond=None)[0]
         residual = local[:, 2] - local[:, :2] @ slope
-        spread = 1.4826 * np.median(np.abs(residual - np.median(residual)))
-        cloud = cloud[np.abs(residual - np.median(residual)) <= max(NO_TERRAIN * spread, 1e-3)]
+        residual -= np.median(residual)
+        spread = 1.4826 * np.median(np.abs(residual))
+        terrain = np.abs(residual) <= max(NO_TERRAIN * spread, 1e-3)
+        if terrain.all():
+            break
+        cloud, noise = cloud[terrain], None if noise is None else noise[terrain]
         centre = cloud.mean(axis=0)
     local = cloud - centre
-    return Surface(local[:, :2].copy(), local[:, 2] - local[:, :2] @ slope, centre, slope)
+    typical = None if noise is None else float(np.median(noise))
+    return Surface(
+        xy=local[:, :2].copy(),
+        elevation=local[:, 2] - local[:, :2] @ slope,
+        centre=centre,
+        slope=slope,
+        relative_noise=np.ones(len(cloud)) if noise is None else noise / typical,
+        typical_noise=typical,
+    )
+
+
+def _checked(points: ArrayLike | Submap, noise: Array | None) -> Submap:
+    submap = points if isinstance(points, Submap) else Submap(np.asarray(points))
+    if noise is None:
+        return submap
+    given = np.asarray(noise)
+    if given.shape != (len(submap),) or not ((given > 0) & np.isfinite(given)).all():
+        dropped = 0 if isinstance(points, Submap) else len(np.asarray(points)) - len(submap)
+        raise TerrainLoopError(
+            expected=f"one positive noise for each of the {len(submap)} points, in metres",
+            found=f"shape {given.shape}" + (f", {dropped} points having been dropped" if dropped else ""),
+            mend="drop repeated and non-finite points first, or give one number",
+        )
+    return submap

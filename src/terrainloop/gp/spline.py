@@ -1,0 +1,122 @@
+"""The Gaussian process from every point, in time linear in points and area: our solver in the C++ core.
+
+The elevation is a spline of degree 7 on knots half a length scale apart, whose weights have the prior
+covariance with which the spline is the process (docs/solver.md).
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from terrainloop import _core
+from terrainloop.errors import TerrainLoopError
+from terrainloop.gp.kernel import Array, Hyperparameters
+from terrainloop.gp.prediction import Prediction, Values
+
+NOISE_CELL = 0.5  # length scales: the ground in a cell is near a plane
+
+
+def predict_grid(
+    xy: Array,
+    elevation: Array,
+    noise: Array,
+    parameters: Hyperparameters,
+    origin: tuple[float, float],
+    resolution: float,
+    shape: tuple[int, int],
+    *,
+    workers: int = 1,
+) -> Prediction:
+    """Posterior on the grid whose pixel (row, column) lies at origin + resolution * (column, row).
+
+    Parameters
+    ----------
+    xy : array, (N, 2)
+        Training points, metres.
+    elevation, noise : array, (N,)
+        Their elevations, the prior having zero mean, and the standard deviation of each, metres.
+    parameters : Hyperparameters
+        Length scale and variance; the noise is given by point.
+    origin : tuple of float
+        (x, y) of pixel (0, 0), metres.
+    resolution : float
+        Metres per pixel.
+    shape : tuple of int
+        Rows (y) and columns (x).
+    workers : int
+        Threads; the result does not depend on it.
+
+    Returns
+    -------
+    Prediction
+        float32.
+
+    Raises
+    ------
+    TerrainLoopError
+        If the equations cannot be solved to tolerance.
+    """
+    maps = _solve(
+        lambda: _core.gp_predict_grid(
+            xy,
+            elevation,
+            noise,
+            length_scale=parameters.length_scale,
+            variance=parameters.variance,
+            x=origin[0],
+            y=origin[1],
+            resolution=resolution,
+            rows=shape[0],
+            cols=shape[1],
+            threads=workers,
+        ),
+        parameters,
+    )
+    return Prediction(*maps)
+
+
+def predict_at(
+    xy: Array,
+    elevation: Array,
+    noise: Array,
+    parameters: Hyperparameters,
+    queries: Array,
+    *,
+    workers: int = 1,
+) -> Prediction:
+    """Posterior at arbitrary places (Q, 2), metres; otherwise as `predict_grid`."""
+    maps = _solve(
+        lambda: _core.gp_predict_at(
+            xy,
+            elevation,
+            noise,
+            length_scale=parameters.length_scale,
+            variance=parameters.variance,
+            queries=queries,
+            threads=workers,
+        ),
+        parameters,
+    )
+    return Prediction(*maps)
+
+
+def noise_ratio(xy: Array, elevation: Array, length_scale: float, *, workers: int = 1) -> Array:
+    """Noise of each point (N,) as a share of the typical one, from the scatter about it.
+
+    In cells of half a length scale the robust scatter about a plane is taken and pooled with that of the
+    cells around. Points further from their cell's plane than three standard deviations have it raised by
+    the square of the excess, so that flying pixels raise no spikes. All ones where points are too sparse.
+    """
+    cell = NOISE_CELL * length_scale
+    return np.ravel(_core.gp_noise_ratio(xy, elevation, cell=cell, threads=workers))
+
+
+def _solve(solve: Callable[[], list[Values]], parameters: Hyperparameters) -> list[Values]:
+    try:
+        return solve()
+    except RuntimeError as error:
+        raise TerrainLoopError(
+            expected="equations that can be solved in double precision",
+            found=f"{error}, with {parameters}",
+            mend="raise the noise or shorten the length scale",
+        ) from error
