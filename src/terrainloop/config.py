@@ -22,6 +22,9 @@ class MapSettings(_Frozen):
     max_points: int | None = Field(
         None, ge=50, description="points kept per submap, drawn at random; null: all"
     )
+    fit_points: int | None = Field(
+        5000, ge=50, description="points per submap that hyperparameters are fitted on; null: all"
+    )
     length_scale: float | None = Field(
         None, gt=0, description="starting length scale of the kernel, m; null: twice the point spacing"
     )

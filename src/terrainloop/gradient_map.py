@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrainloop.errors import TerrainLoopError
+from terrainloop.gp.hyperparameters import FIT_POINTS
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.gp.process import ElevationProcess, Solver, check_positive
 from terrainloop.gp.surface import Surface
@@ -77,6 +78,7 @@ class GradientMap:
         origin: tuple[float, float] | None = None,
         shape: tuple[int, int] | None = None,
         max_points: int | None = None,
+        fit_points: int | None = FIT_POINTS,
         remove_plane: bool = True,
         local_noise: bool = True,
         solver: Solver = "spline",
@@ -103,6 +105,8 @@ class GradientMap:
             Rows (y) and columns (x); as far as the bounding box reaches if not given.
         max_points : int, optional
             Drawn at random if the cloud has more; all are used if not given.
+        fit_points : int or None
+            Of these, drawn for the fit; None: all (see `fit_hyperparameters`).
         remove_plane : bool
             Take the best plane out before and give its slope back after.
         local_noise : bool
@@ -130,6 +134,7 @@ class GradientMap:
             variance,
             noise,
             max_points=max_points,
+            fit_points=fit_points,
             remove_plane=remove_plane,
             local_noise=local_noise,
             solver=solver,

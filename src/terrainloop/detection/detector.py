@@ -121,11 +121,12 @@ class LoopDetector:
 
 def fit_database(submaps: Sequence[Submap], settings: Settings, *, workers: int = 1) -> Hyperparameters:
     """Hyperparameters for all maps of a database, so that they are comparable."""
+    limits = [n for n in (settings.map.max_points, settings.map.fit_points) if n is not None]
     return fit_hyperparameters(
         submaps,
         length_scale=settings.map.length_scale,
         noise=settings.map.noise,
-        max_points=settings.map.max_points,
+        max_points=min(limits, default=None),
         exact=settings.map.solver == "exact",
         remove_plane=settings.map.remove_plane,
         seed=settings.seed,

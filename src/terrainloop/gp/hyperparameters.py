@@ -22,6 +22,9 @@ from terrainloop.submap import Submap
 # spacing of the points would only turn the terrain into noise.
 SPAN = {"length_scale": 10.0, "variance": 1e3, "noise": 1e3}
 
+# Drawn from a cloud for a fit: a few thousand lie further apart than stereo's errors reach (docs/solver.md).
+FIT_POINTS = 5000
+
 # Of the blocks of a search: their side in length scales, and the sum of r^3 over their ranks r. The first
 # finds about where the length scale lies; the larger the blocks, the nearer to the likelihood of all points.
 SEARCHES = ((4.0, 3e7), (10.0, 1e9))
@@ -74,7 +77,7 @@ def fit_hyperparameters(
     variance: float | None = None,
     noise: float | None = None,
     *,
-    max_points: int | None = None,
+    max_points: int | None = FIT_POINTS,
     exact: bool = False,
     remove_plane: bool = True,
     seed: int = 0,
@@ -88,9 +91,9 @@ def fit_hyperparameters(
         Gravity-aligned points, metres.
     length_scale, variance, noise : float, optional
         Where the search begins: metres, metres squared (default: the elevations' own), metres.
-    max_points : int, optional
-        Drawn at random from each cloud; all if not given. Fit on as many as the maps are made of:
-        thinner data ask for a longer length scale.
+    max_points : int or None
+        Drawn at random from each cloud; None: all. Denser points ask for a shorter length scale: their
+        errors, which neighbours share, count as terrain, for the process takes noise to be white.
     exact : bool
         By the likelihood of all points of a cloud at once, which takes minutes for 5000 of them; if not,
         by that of square blocks, from any number of points (see `fit_blocks`).
@@ -113,9 +116,7 @@ def fit_hyperparameters(
     """
     if len(clouds) == 0:
         raise TerrainLoopError(expected="at least one cloud", found="none", mend="pass a list of clouds")
-    surfaces = [
-        surface_of(cloud, max_points=max_points, remove_plane=remove_plane, seed=seed) for cloud in clouds
-    ]
+    surfaces = [surface_of(cloud, remove_plane=remove_plane).drawn(max_points, seed) for cloud in clouds]
     start = surfaces[0].start(length_scale, variance, noise)
     fit = maximise_likelihood if exact else fit_blocks
     return fit(surfaces, start, workers=workers)

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp import exact, spline
-from terrainloop.gp.hyperparameters import fit_blocks, maximise_likelihood
+from terrainloop.gp.hyperparameters import FIT_POINTS, fit_blocks, maximise_likelihood
 from terrainloop.gp.kernel import Array, Hyperparameters
 from terrainloop.gp.prediction import Prediction
 from terrainloop.gp.surface import Surface, surface_of
@@ -57,6 +57,7 @@ class ElevationProcess:
         noise: float | ArrayLike | None = None,
         *,
         max_points: int | None = None,
+        fit_points: int | None = FIT_POINTS,
         remove_plane: bool = True,
         local_noise: bool = True,
         solver: Solver = "spline",
@@ -64,9 +65,12 @@ class ElevationProcess:
         workers: int = 1,
     ) -> "ElevationProcess":
         """Settle what is not given; the parameters are those of `GradientMap.from_points`."""
-        each = None if noise is None or np.ndim(noise) == 0 else np.asarray(noise)
-        surface = surface_of(points, max_points=max_points, remove_plane=remove_plane, noise=each, seed=seed)
-        typical = noise if each is None else surface.typical_noise
+        given_noise = None if noise is None else np.asarray(noise, dtype=np.float64)
+        each = given_noise if given_noise is not None and given_noise.ndim else None
+        surface = surface_of(points, remove_plane=remove_plane, noise=each).drawn(max_points, seed)
+        typical = surface.typical_noise
+        if typical is None and given_noise is not None:
+            typical = float(given_noise)
         given = {"length_scale": length_scale, "variance": variance, "noise": typical}
         check_positive(**given)
         parameters = surface.start(**given)
@@ -74,7 +78,8 @@ class ElevationProcess:
         fixed = [name for name, value in given.items() if value is not None]
         if len(fixed) < len(given):
             fit = maximise_likelihood if solver == "exact" else fit_blocks
-            parameters = fit([surface], parameters, fixed=fixed, workers=workers)
+            drawn = surface.drawn(fit_points, seed)
+            parameters = fit([drawn], drawn.start(**given), fixed=fixed, workers=workers)
             _check_extent(surface, parameters.length_scale)
         ratio = surface.relative_noise
         if each is None and local_noise:

@@ -7,11 +7,12 @@ covariance with which the spline is the process (docs/solver.md).
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrainloop import _core
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.kernel import Array, Hyperparameters
-from terrainloop.gp.prediction import Prediction, Values
+from terrainloop.gp.prediction import Prediction
 
 NOISE_CELL = 0.5  # length scales: the ground in a cell is near a plane
 
@@ -111,7 +112,9 @@ def noise_ratio(xy: Array, elevation: Array, length_scale: float, *, workers: in
     return np.ravel(_core.gp_noise_ratio(xy, elevation, cell=cell, threads=workers))
 
 
-def _solve(solve: Callable[[], list[Values]], parameters: Hyperparameters) -> list[Values]:
+def _solve(
+    solve: Callable[[], list[NDArray[np.float32]]], parameters: Hyperparameters
+) -> list[NDArray[np.float32]]:
     try:
         return solve()
     except RuntimeError as error:

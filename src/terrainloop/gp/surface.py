@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.kernel import Array, Hyperparameters
@@ -69,17 +69,11 @@ class Surface:
             noise=0.2 * relief if noise is None else noise,
         )
 
-    def blocks(self, max_points: int) -> list["Surface"]:
-        """The surface cut at medians, across its longer side, into parts of at most `max_points`."""
-        if len(self.xy) <= max_points:
-            return [self]
-        axis = int(np.argmax(np.ptp(self.xy, axis=0)))
-        order = np.argsort(self.xy[:, axis], kind="stable")
-        halves = np.array_split(order, 2)
-        parts = (self._take(half) for half in halves)
-        return [block for part in parts for block in part.blocks(max_points)]
-
-    def _take(self, rows: NDArray[np.intp]) -> "Surface":
+    def drawn(self, count: int | None, seed: int) -> "Surface":
+        """At most `count` of the points, at random."""
+        if count is None or len(self.xy) <= count:
+            return self
+        rows = np.sort(np.random.default_rng(seed).choice(len(self.xy), count, replace=False))
         parts = {name: getattr(self, name)[rows] for name in ("xy", "elevation", "relative_noise")}
         return replace(self, **parts)
 
@@ -87,12 +81,10 @@ class Surface:
 def surface_of(
     points: ArrayLike | Submap,
     *,
-    max_points: int | None = None,
     remove_plane: bool = True,
     noise: Array | None = None,
-    seed: int = 0,
 ) -> Surface:
-    """Refer points (N, 3) to their centre, at most `max_points` of them drawn at random.
+    """Refer points (N, 3) to their centre and plane.
 
     Raises
     ------
@@ -102,9 +94,6 @@ def surface_of(
     cloud = _checked(points, noise).points
     if noise is not None:
         noise = np.asarray(noise, dtype=np.float64)
-    if max_points is not None and len(cloud) > max_points:
-        rows = np.sort(np.random.default_rng(seed).choice(len(cloud), max_points, replace=False))
-        cloud, noise = cloud[rows], None if noise is None else noise[rows]
     centre, slope = cloud.mean(axis=0), np.zeros(2)
     for _ in range(PLANE_FITS if remove_plane else 0):
         local = cloud - centre
@@ -118,14 +107,17 @@ def surface_of(
         cloud, noise = cloud[terrain], None if noise is None else noise[terrain]
         centre = cloud.mean(axis=0)
     local = cloud - centre
-    typical = None if noise is None else float(np.median(noise))
+    relative_noise, typical_noise = np.ones(len(cloud)), None
+    if noise is not None:
+        typical_noise = float(np.median(noise))
+        relative_noise = noise / typical_noise
     return Surface(
         xy=local[:, :2].copy(),
         elevation=local[:, 2] - local[:, :2] @ slope,
         centre=centre,
         slope=slope,
-        relative_noise=np.ones(len(cloud)) if noise is None else noise / typical,
-        typical_noise=typical,
+        relative_noise=relative_noise,
+        typical_noise=typical_noise,
     )
 
 
