@@ -163,8 +163,22 @@ def test_noise_ratio_follows_the_noise():
 
 
 def test_noise_ratio_is_constant_where_points_are_too_sparse():
-    xy, height, _ = ground(count=200)
-    np.testing.assert_array_equal(spline.noise_ratio(xy, height, 0.3), 1.0)
+    xy = 0.5 * np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0)), axis=-1).reshape(-1, 2)
+    height = np.random.default_rng(0).standard_normal(len(xy))
+    np.testing.assert_array_equal(spline.noise_ratio(xy, height, 0.6), 1.0)
+
+
+def test_points_of_one_patch_count_as_one():
+    """Ten times the points, with the errors of their neighbours, say no more of the ground."""
+    xy, height, rng = ground(3000)
+    many = np.repeat(xy, 10, axis=0) + rng.uniform(0, 1e-3, (30_000, 2))
+    parameters = Hyperparameters(0.5, 0.01, 0.02)
+    variances = []
+    for places, z in ((xy, height), (many, np.repeat(height, 10))):
+        noise = parameters.noise * spline.noise_ratio(places, z, parameters.length_scale)
+        made = spline.predict_grid(places, z, noise, parameters, (1.0, 1.0), 0.2, (20, 20))
+        variances.append(made.variance)
+    assert np.median(variances[1] / variances[0]) == pytest.approx(1.0, abs=0.1)
 
 
 def flying(xy, height, rng, count=60):

@@ -32,7 +32,7 @@ class MapSettings(_Frozen):
         None, gt=0, description="starting accuracy of the elevations, m; null: a fifth of the relief"
     )
     local_noise: bool = Field(
-        True, description="scale the noise by the scatter around each point, as stereo's grows with range"
+        True, description="scale each point's noise by the scatter and the number of the points around it"
     )
     fit: Literal["database", "submap"] = Field(
         "database", description="maximise the likelihood once (maps stay comparable) or for every submap"

@@ -110,8 +110,8 @@ class GradientMap:
         remove_plane : bool
             Take the best plane out before and give its slope back after.
         local_noise : bool
-            Scale the noise by the scatter of the points around each (see `noise_ratio`); not done where
-            noise is given for each point.
+            Scale each point's noise by the scatter and the number of the points around it (see
+            `terrainloop.gp.spline.noise_ratio`); not done where noise is given for each point.
         solver : str
             "spline" takes every point; "exact" is dense, for some thousands of points.
         max_variance_ratio : float

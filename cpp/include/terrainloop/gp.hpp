@@ -47,13 +47,15 @@ void predict_grid(const Points& points, const Hyperparameters& parameters, const
 void predict_at(const Points& points, const Hyperparameters& parameters, const double* queries,
                 std::size_t count, const Maps& maps, int threads = 1);
 
-/// How the noise of a cloud varies over the ground: each point's as a share of the typical one.
+/// Noise of each point as a share of that of a single typical one, from the points around it.
 ///
 /// In square cells of side `cell` (metres; half a length scale, so that the ground in one is near a plane)
 /// the robust scatter about a plane is taken and pooled with that of the cells around; where it grows, as
 /// that of stereo does with the range, so does the ratio. Points further from their cell's plane than three
-/// standard deviations have it raised by the square of the excess, so that flying pixels raise no spikes. All
-/// ones where the points are too sparse to tell. `ratio` is (count).
+/// standard deviations have it raised by the square of the excess, so that flying pixels raise no spikes. The
+/// n points in a square of half that side have it raised by sqrt(n), so that they count as one: the errors of
+/// neighbours are much the same, and do not average out. Where the points are too sparse to tell a scatter,
+/// only the last is left. `ratio` is (count).
 void noise_ratio(const double* xy, const double* elevation, std::size_t count, double cell, double* ratio,
                  int threads = 1);
 

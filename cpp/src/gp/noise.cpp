@@ -10,6 +10,7 @@
 namespace terrainloop::gp {
 namespace {
 
+constexpr int kPatches = 2;         // to a side of a cell: points of one patch share their error
 constexpr std::size_t kFewest = 8;  // points that tell the scatter in a cell
 constexpr double kEnough = 0.2;     // share of the points in such cells, below which the noise stays constant
 constexpr int kRefits = 3;
@@ -130,7 +131,9 @@ void noise_ratio(const double* xy, const double* elevation, std::size_t count, d
   std::vector<double> told;
   for (std::size_t i = 0; i < count; ++i)
     if (known(cells.of_point[i]) > 0.0) told.push_back(deviation(cells.of_point[i]));
-  std::fill(ratio, ratio + count, 1.0);
+  const Cells patches = sort_into_cells(xy, count, cell / kPatches);
+  for (std::size_t i = 0; i < count; ++i)
+    ratio[i] = std::sqrt(patches.first[patches.of_point[i] + 1] - patches.first[patches.of_point[i]]);
   if (told.size() < kEnough * count) return;
   const double typical = median(told);
   if (!(typical > 0.0)) return;
@@ -139,7 +142,7 @@ void noise_ratio(const double* xy, const double* elevation, std::size_t count, d
     if (here <= 0.0) continue;
     const double smallest = std::max(here, kSmallest * typical);
     const double excess = std::max(1.0, std::abs(residuals[i]) / (kOutlier * smallest));
-    ratio[i] = smallest / typical * excess * excess;
+    ratio[i] *= smallest / typical * excess * excess;
   }
 }
 

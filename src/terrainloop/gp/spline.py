@@ -102,11 +102,29 @@ def predict_at(
 
 
 def noise_ratio(xy: Array, elevation: Array, length_scale: float, *, workers: int = 1) -> Array:
-    """Noise of each point (N,) as a share of the typical one, from the scatter about it.
+    """Noise of each point as a share of that of a single typical one, from the points around it.
 
-    In cells of half a length scale the robust scatter about a plane is taken and pooled with that of the
-    cells around. Points further from their cell's plane than three standard deviations have it raised by
-    the square of the excess, so that flying pixels raise no spikes. All ones where points are too sparse.
+    Three effects are multiplied. In cells of half a length scale the robust scatter about a plane is taken
+    and pooled with that of the cells around: it grows where the sensor's noise does. Points further from
+    their cell's plane than three standard deviations are raised by the square of the excess: flying pixels
+    raise no spikes. The n points in a square of a quarter of a length scale are raised by sqrt(n), so that
+    they count as one: the errors of neighbours are much the same, and do not average out.
+
+    Parameters
+    ----------
+    xy : array, (N, 2)
+        Metres.
+    elevation : array, (N,)
+        Metres.
+    length_scale : float
+        Metres.
+    workers : int
+        Threads; the result does not depend on it.
+
+    Returns
+    -------
+    array, (N,)
+        Where points are too sparse to tell a scatter, only the last effect is left.
     """
     cell = NOISE_CELL * length_scale
     return np.ravel(_core.gp_noise_ratio(xy, elevation, cell=cell, threads=workers))
