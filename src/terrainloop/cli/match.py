@@ -49,7 +49,7 @@ def command(
     with terminal.progress() as progress:
         progress("maps", 0, 2)
         shared = settings.map.fit == "database"
-        parameters = fit_database(submaps, settings) if shared else None
+        parameters = fit_database(submaps, settings, workers=worker_count(workers)) if shared else None
         mapped = []
         for done, submap in enumerate(submaps, start=1):
             mapped.append(map_submap(submap, settings, parameters, workers=worker_count(workers)))

@@ -85,7 +85,7 @@ class LoopDetector:
         self._check_name(submap.name)
         parameters = self.parameters
         if parameters is None and self.settings.map.fit == "database":
-            parameters = fit_database([submap], self.settings)
+            parameters = fit_database([submap], self.settings, workers=self.workers)
         query = map_submap(submap, self.settings, parameters, workers=self.workers)
         self.parameters = parameters
         return self.add_mapped(query)
@@ -148,7 +148,7 @@ def map_submap(
     workers : int
         Threads; the result does not depend on it.
     """
-    parameters = parameters or fit_database([submap], settings)
+    parameters = parameters or fit_database([submap], settings, workers=workers)
     gradient_map = GradientMap.from_points(
         submap,
         parameters.length_scale,

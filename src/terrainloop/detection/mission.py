@@ -60,7 +60,7 @@ def detect_mission(
     TerrainLoopError
         If no cloud can be used.
     """
-    parameters = _fit_mission(mission, settings) if settings.map.fit == "database" else None
+    parameters = _fit_mission(mission, settings, workers) if settings.map.fit == "database" else None
     detector = LoopDetector(settings, parameters=parameters, workers=workers)
     clouds: list[MappedCloud] = []
     for cloud in _map_clouds(mission, settings, parameters, workers):
@@ -80,7 +80,7 @@ def detect_mission(
     return detector, [cloud.record for cloud in clouds]
 
 
-def _fit_mission(mission: Mission, settings: Settings) -> Hyperparameters | None:
+def _fit_mission(mission: Mission, settings: Settings, workers: int) -> Hyperparameters | None:
     """Hyperparameters of a few usable submaps spread over the mission; None if none is usable."""
     spread = np.linspace(0, len(mission) - 1, FITTED_SUBMAPS + 2).astype(int)[1:-1].tolist()
     submaps: list[Submap] = []
@@ -88,7 +88,7 @@ def _fit_mission(mission: Mission, settings: Settings) -> Hyperparameters | None
         if len(submaps) < FITTED_SUBMAPS:
             with suppress(TerrainLoopError):
                 submaps.append(mission.read(index))
-    return fit_database(submaps, settings) if submaps else None
+    return fit_database(submaps, settings, workers=workers) if submaps else None
 
 
 def _map_clouds(
