@@ -122,7 +122,8 @@ void Subdomain::factorise(const Information& information, double variance, Eigen
   assemble(information, variance, lower);
   const Eigen::LLT<Eigen::Ref<Matrix>> factor(lower);
   const auto pivots = lower.diagonal();
-  if (factor.info() != Eigen::Success || !(pivots.minCoeff() > kSingular * pivots.maxCoeff()))
+  if (factor.info() != Eigen::Success || !pivots.allFinite() ||
+      pivots.minCoeff() < kSingular * pivots.maxCoeff())
     throw std::runtime_error("the equations of a subdomain are not positive definite");
   factor_ = PackedFactor(lower);
   if (covariance == nullptr) return;
