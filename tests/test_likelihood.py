@@ -172,3 +172,12 @@ def test_numbers_that_make_no_model_are_refused(surface):
         blocks_of(surface, side=-1.0)
     with pytest.raises(ValueError, match="noise positive"):
         blocks_of(Surface(surface.xy, surface.elevation, np.zeros(3), np.zeros(2), np.zeros(400)))
+
+
+def test_where_drawn_points_show_only_noise_more_are_drawn():
+    """On 20 x 20 m 300 points lie five length scales apart."""
+    wide = draw(30_000, 20.0)
+    cloud = np.c_[wide.xy, wide.elevation]
+    fitted = fit_hyperparameters([cloud], max_points=300, remove_plane=False)
+    assert fitted.length_scale == pytest.approx(TRUTH.length_scale, rel=0.15)
+    assert fitted.noise == pytest.approx(TRUTH.noise, rel=0.15)

@@ -24,6 +24,7 @@ SPAN = {"length_scale": 10.0, "variance": 1e3, "noise": 1e3}
 
 # Drawn from a cloud for a fit: a few thousand lie further apart than stereo's errors reach (docs/solver.md).
 FIT_POINTS = 5000
+ONLY_NOISE = 0.1  # of the noise squared: a smaller variance is no terrain
 
 # Of the blocks of a search: their side in length scales, and the sum of r^3 over their ranks r. The first
 # finds about where the length scale lies; the larger the blocks, the nearer to the likelihood of all points.
@@ -116,10 +117,53 @@ def fit_hyperparameters(
     """
     if len(clouds) == 0:
         raise TerrainLoopError(expected="at least one cloud", found="none", mend="pass a list of clouds")
-    surfaces = [surface_of(cloud, remove_plane=remove_plane).drawn(max_points, seed) for cloud in clouds]
-    start = surfaces[0].start(length_scale, variance, noise)
+    surfaces = [surface_of(cloud, remove_plane=remove_plane) for cloud in clouds]
+    return fit_surfaces(
+        surfaces,
+        length_scale,
+        variance,
+        noise,
+        max_points=max_points,
+        exact=exact,
+        seed=seed,
+        workers=workers,
+    )
+
+
+def fit_surfaces(
+    surfaces: Sequence[Surface],
+    length_scale: float | None = None,
+    variance: float | None = None,
+    noise: float | None = None,
+    *,
+    fixed: Sequence[str] = (),
+    max_points: int | None = FIT_POINTS,
+    exact: bool = False,
+    seed: int = 0,
+    workers: int = 1,
+) -> Hyperparameters:
+    """As `fit_hyperparameters`, those named in `fixed` keeping the value given.
+
+    While all that the drawn points show is noise, four times as many are drawn: on wide ground a few
+    thousand may lie too far apart to tell its shape.
+    """
+    drawn = [surface.drawn(max_points, seed) for surface in surfaces]
+    start = drawn[0].start(length_scale, variance, noise)
     fit = maximise_likelihood if exact else fit_blocks
-    return fit(surfaces, start, workers=workers)
+    fitted = fit(drawn, start, fixed=fixed, workers=workers)
+    shows_terrain = fitted.variance > ONLY_NOISE * fitted.noise**2
+    if exact or shows_terrain or max_points is None or max_points >= max(len(s.xy) for s in surfaces):
+        return fitted
+    return fit_surfaces(
+        surfaces,
+        length_scale,
+        variance,
+        noise,
+        fixed=fixed,
+        max_points=4 * max_points,
+        seed=seed,
+        workers=workers,
+    )
 
 
 def fit_blocks(

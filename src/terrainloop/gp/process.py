@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp import exact, spline
-from terrainloop.gp.hyperparameters import FIT_POINTS, fit_blocks, maximise_likelihood
+from terrainloop.gp.hyperparameters import FIT_POINTS, fit_surfaces
 from terrainloop.gp.kernel import Array, Hyperparameters
 from terrainloop.gp.prediction import Prediction
 from terrainloop.gp.surface import Surface, surface_of
@@ -77,9 +77,15 @@ class ElevationProcess:
         _check_extent(surface, parameters.length_scale)
         fixed = [name for name, value in given.items() if value is not None]
         if len(fixed) < len(given):
-            fit = maximise_likelihood if solver == "exact" else fit_blocks
-            drawn = surface.drawn(fit_points, seed)
-            parameters = fit([drawn], drawn.start(**given), fixed=fixed, workers=workers)
+            parameters = fit_surfaces(
+                [surface],
+                **given,
+                fixed=fixed,
+                max_points=fit_points,
+                exact=solver == "exact",
+                seed=seed,
+                workers=workers,
+            )
             _check_extent(surface, parameters.length_scale)
         ratio = surface.relative_noise
         if each is None and local_noise:
