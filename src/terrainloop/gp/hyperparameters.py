@@ -144,14 +144,15 @@ def fit_surfaces(
 ) -> Hyperparameters:
     """As `fit_hyperparameters`, those named in `fixed` keeping the value given.
 
-    While all that the drawn points show is noise, four times as many are drawn: on wide ground a few
-    thousand may lie too far apart to tell its shape.
+    While all that the drawn points show is noise, or ground that changes from one to the next, four times
+    as many are drawn: on wide ground a few thousand may lie too far apart to tell its shape.
     """
     drawn = [surface.drawn(max_points, seed) for surface in surfaces]
     start = drawn[0].start(length_scale, variance, noise)
     fit = maximise_likelihood if exact else fit_blocks
     fitted = fit(drawn, start, fixed=fixed, workers=workers)
-    shows_terrain = fitted.variance > ONLY_NOISE * fitted.noise**2
+    spacing = min(surface.spacing for surface in drawn)
+    shows_terrain = fitted.variance > ONLY_NOISE * fitted.noise**2 and fitted.length_scale > spacing
     if exact or shows_terrain or max_points is None or max_points >= max(len(s.xy) for s in surfaces):
         return fitted
     return fit_surfaces(
