@@ -66,6 +66,7 @@ class MatchSettings(_Frozen):
     max_ssd_ratio: float = Field(
         0.5, gt=0, description="largest SSD, as a share of what unrelated ground would give"
     )
+    refine: bool = Field(True, description="settle the pose on the gradients of all shared ground")
 
 
 class Settings(_Frozen):
@@ -101,7 +102,7 @@ class Settings(_Frozen):
                     remove_plane=False,
                 ),
                 features=FeatureSettings(kind="surf"),
-                match=MatchSettings(inlier_radius=0.09, max_ssd_ratio=1.0),
+                match=MatchSettings(inlier_radius=0.09, max_ssd_ratio=1.0, refine=False),
             )
         raise TerrainLoopError(
             expected="preset 'default' or 'paper'", found=repr(name), mend="name one of the two"

@@ -1,6 +1,7 @@
 """The one entry to matching: whether two gradient maps show the same place, and how they lie."""
 
 import zlib
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from terrainloop.loop import LoopCandidate
 from terrainloop.matching.correspondences import Associations, associate
 from terrainloop.matching.lift import lift_to_se3
 from terrainloop.matching.ransac import Alignment, register_by_ransac
+from terrainloop.matching.refine import refine
+from terrainloop.matching.ssd import compute_ssd
 
 
 def features_of(gradient_map: GradientMap, settings: Settings) -> Features:
@@ -59,6 +62,8 @@ def register(
     alignment = align(source_map, target_map, associations, settings, names)
     if alignment is None:
         return _rejected(names, f"no transform: no two of {len(associations)} associations agree on one")
+    if settings.match.refine and alignment.ssd.ratio <= settings.match.max_ssd_ratio:
+        alignment = _refined(source_map, target_map, alignment)
     matched = transform(alignment.T_target_source, associations.source[alignment.inliers])
     residuals = matched - associations.target[alignment.inliers]
     T, covariance = lift_to_se3(source_map, target_map, alignment.T_target_source, matched, residuals)
@@ -98,6 +103,15 @@ def align(
         max_ssd_ratio=match.max_ssd_ratio,
         rng=np.random.default_rng([settings.seed, *(zlib.crc32(name.encode()) for name in names)]),
     )
+
+
+def _refined(source_map: GradientMap, target_map: GradientMap, alignment: Alignment) -> Alignment:
+    """The alignment at which the maps agree best; as it was, if that is no better."""
+    T = refine(source_map, target_map, alignment.T_target_source)
+    ssd = compute_ssd(source_map, target_map, T)
+    if not ssd.ratio < alignment.ssd.ratio:
+        return alignment
+    return replace(alignment, T_target_source=T, ssd=ssd)
 
 
 def _decide(alignment: Alignment, settings: Settings) -> tuple[bool, str]:
