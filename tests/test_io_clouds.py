@@ -483,3 +483,10 @@ def test_real_airborne_lidar():
     assert len(submap) == len(np.unique(las.xyz, axis=0))
     assert set(np.unique(submap.intensity)) <= set(np.unique(las.intensity))
     assert len(submap.repairs) == 2
+
+
+def test_a_raster_of_heights_is_no_cloud(tmp_path):
+    path = tmp_path / "dem.csv"
+    np.savetxt(path, np.random.default_rng(0).normal(size=(150, 200)), delimiter=",")
+    with pytest.raises(TerrainLoopError, match="200 numbers a line and no header: a raster"):
+        read_cloud(path)

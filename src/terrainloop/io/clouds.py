@@ -18,6 +18,7 @@ from terrainloop.submap import Submap
 Columns = Mapping[str, NDArray[Any]]
 """What a file holds, one array a point property, in the type it was stored in."""
 
+_WIDEST = 32  # columns of a text cloud without a header
 _INTENSITY = ("intensity", "reflectivity", "scalar_intensity")
 _COMMENTS = ("#", "//")
 _LONGEST_HEADER = 1 << 16  # bytes
@@ -314,12 +315,15 @@ def _read_text(path: Path) -> Columns:
     try:
         if not body:
             raise ValueError("no line of numbers")
+        width = len(body[0].split(delimiter))
+        if width > _WIDEST and names == ["x", "y", "z"]:
+            raise ValueError(f"{width} numbers a line and no header: a raster of heights")
         table = np.loadtxt(body, delimiter=delimiter, comments=_COMMENTS, usecols=columns, ndmin=2)
     except ValueError as error:
         raise TerrainLoopError(
             expected="lines of at least three numbers, x y z, after one header line at most",
             found=str(error),
-            mend="export plain numbers with decimal points",
+            mend="export plain numbers with decimal points, one point a line",
         ) from error
     return dict(zip(wanted, table.T, strict=True))
 
