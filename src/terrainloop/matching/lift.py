@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from terrainloop.geometry import Array, inverse, se3, transform, yaw_of
 from terrainloop.gradient_map import GradientMap
-from terrainloop.matching.ssd import warp
+from terrainloop.matching.ssd import shared_ground, warp
 
 CLIP = 3.0  # robust standard deviations beyond which an elevation difference is an outlier
 
@@ -38,7 +38,7 @@ def lift_to_se3(
     covariance : array, (6, 6)
         Of (x, y, z, roll, pitch, yaw); NaN where too little ground is shared to tell the tilt.
     """
-    both = target.mask & (warp(source.mask.astype(np.float32), source, target, T_planar) > 0.999)
+    both = shared_ground(source, target, T_planar)
     if both.sum() * target.resolution**2 <= 4 * _independent_area(target):
         no_tilt = se3(T_planar[0, 2], T_planar[1, 2], 0.0, 0.0, 0.0, yaw_of(T_planar))
         return no_tilt, np.full((6, 6), np.nan)

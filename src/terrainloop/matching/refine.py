@@ -3,9 +3,9 @@
 import cv2
 import numpy as np
 
-from terrainloop.geometry import Array
+from terrainloop.geometry import Array, se2
 from terrainloop.gradient_map import GradientMap
-from terrainloop.matching.ssd import warp
+from terrainloop.matching.ssd import shared_ground, warp
 
 STEPS = 10
 CONVERGED = 1e-4  # metres and radians
@@ -47,8 +47,8 @@ def refine(source: GradientMap, target: GradientMap, T_target_source: Array) -> 
 
 def _step(source: GradientMap, target: GradientMap, T: Array) -> Array | None:
     """The SE(2) motion, from the left, that Gauss-Newton makes; None if too little ground is shared."""
-    known = (warp(source.mask.astype(np.float32), source, target, T) > 0.999) & target.mask
-    shared = cv2.erode(known.astype(np.uint8), np.ones((3, 3)), borderValue=0).astype(bool)
+    both = shared_ground(source, target, T)
+    shared = cv2.erode(both.astype(np.uint8), np.ones((3, 3)), borderValue=0).astype(bool)  # has slopes
     if shared.sum() < FEWEST:
         return None
     rotation = T[:2, :2]
@@ -75,7 +75,6 @@ def _step(source: GradientMap, target: GradientMap, T: Array) -> Array | None:
     w = w / (1.0 + (normalised / (CAUCHY * max(spread, 1e-12))) ** 2)
     normal = jacobian.T @ (w[:, None] * jacobian)
     dx, dy, turn = -np.linalg.lstsq(normal, jacobian.T @ (w * r), rcond=None)[0][:3]
-    c, s = np.cos(turn), np.sin(turn)
-    move = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    move = se2(0.0, 0.0, turn)
     move[:2, 2] = pivot - move[:2, :2] @ pivot + (dx, dy)
     return move

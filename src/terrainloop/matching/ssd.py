@@ -42,8 +42,7 @@ def compute_ssd(source: GradientMap, target: GradientMap, T_target_source: Array
     step : int
         Look at every step-th row and column of the target only.
     """
-    known = warp(source.mask.astype(np.float32), source, target, T_target_source, step) > 0.999
-    both = known & target.mask[::step, ::step]
+    both = shared_ground(source, target, T_target_source, step)
     shared = int(both.sum())
     if shared == 0:
         return Ssd(value=0.0, ratio=np.inf, overlap=0.0)
@@ -58,6 +57,15 @@ def compute_ssd(source: GradientMap, target: GradientMap, T_target_source: Array
     value = float(weights @ (g_q - g_d) ** 2)
     unrelated = float(weights @ (_centred(g_q, weights) ** 2 + _centred(g_d, weights) ** 2))
     return Ssd(value=value, ratio=value / unrelated if unrelated > 0 else np.inf, overlap=float(overlap))
+
+
+def shared_ground(
+    source: GradientMap, target: GradientMap, T_target_source: Array, step: int = 1
+) -> NDArray[np.bool_]:
+    """Where both maps know the ground, on every step-th pixel of the target."""
+    known = warp(source.mask.astype(np.float32), source, target, T_target_source, step) > 0.999
+    both: NDArray[np.bool_] = known & target.mask[::step, ::step]
+    return both
 
 
 def warp(

@@ -16,7 +16,7 @@ from terrainloop.geometry import Array, transform
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.correspondences import Associations
-from terrainloop.matching.ssd import warp
+from terrainloop.matching.ssd import shared_ground, warp
 from terrainloop.submap import Submap
 
 SOURCE_COLOUR, TARGET_COLOUR = "#d1495b", "#00798c"
@@ -32,7 +32,9 @@ def figure_map(submap: Submap, gradient_map: GradientMap) -> Figure:
     )
     first = figure.add_subplot(2, 3, 1)
     drawn = submap.points[:: max(1, len(submap) // DRAWN_POINTS)]
-    dots = first.scatter(drawn[:, 0], drawn[:, 1], c=drawn[:, 2], s=0.3, cmap="gist_earth", linewidths=0)
+    low, high = np.percentile(drawn[:, 2], [0.5, 99.5])  # a flying pixel must not take the colours
+    heights: dict[str, Any] = {"c": drawn[:, 2], "cmap": "gist_earth", "vmin": low, "vmax": high}
+    dots = first.scatter(drawn[:, 0], drawn[:, 1], s=0.3, linewidths=0, **heights)
     _finish(first, "(a) point cloud, height")
     figure.colorbar(dots, ax=first, label="m")
     steep = _steepest(gradient_map)
@@ -195,8 +197,7 @@ def _planar(T_target_source: Array) -> Array:
 def _overlay(axes: Axes, source_map: GradientMap, target_map: GradientMap, T_target_source: Array) -> None:
     """Source in one colour over the target in its opposite: grey where they agree."""
     moved = warp(source_map.magnitude, source_map, target_map, _planar(T_target_source))
-    known = warp(source_map.mask.astype(np.float32), source_map, target_map, _planar(T_target_source)) > 0.999
-    both = known & target_map.mask
+    both = shared_ground(source_map, target_map, _planar(T_target_source))
     steep = _steepest(target_map)
     image = np.ones((*both.shape, 3))
     image[both, 0] = np.clip(moved / steep, 0, 1)[both]
