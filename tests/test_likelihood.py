@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from terrainloop import _core
+from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.hyperparameters import (
     fit_blocks,
     fit_hyperparameters,
@@ -181,3 +182,8 @@ def test_where_drawn_points_show_only_noise_more_are_drawn():
     fitted = fit_hyperparameters([cloud], max_points=300, remove_plane=False)
     assert fitted.length_scale == pytest.approx(TRUTH.length_scale, rel=0.15)
     assert fitted.noise == pytest.approx(TRUTH.noise, rel=0.15)
+
+
+def test_too_many_points_for_the_dense_fit_are_refused():
+    with pytest.raises(TerrainLoopError, match="max_points"):
+        maximise_likelihood([draw(30_000, 20.0)], TRUTH)

@@ -75,7 +75,7 @@ def test_noise_of_each_point_equals_the_exact_process():
     corner, resolution, shape = grid(3.0, 40)
     axis = resolution * np.arange(40)
     fast = spline.predict_grid(xy, z, parameters.noise * ratio, parameters, corner, resolution, shape)
-    reference = exact.predict_grid(xy, z, parameters, axis, axis, relative_noise=ratio)
+    reference = exact.predict_grid(xy, z, parameters, axis, axis, noise=parameters.noise * ratio)
     gradient, std, _ = errors(fast, reference, parameters.variance)
     assert gradient < 1e-3
     assert std[0] < 5e-3

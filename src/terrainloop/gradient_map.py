@@ -146,12 +146,9 @@ class GradientMap:
             resolution = parameters.length_scale / PIXELS_PER_LENGTH_SCALE
         origin, shape = _grid(process.surface, resolution, origin, shape)
         field = process.predict_grid(origin, resolution, shape)
+        images = {name: image.astype(np.float32, copy=False) for name, image in vars(field).items()}
         return cls(
-            elevation=field.elevation.astype(np.float32, copy=False),
-            gradient_x=field.gradient_x.astype(np.float32, copy=False),
-            gradient_y=field.gradient_y.astype(np.float32, copy=False),
-            variance=field.variance.astype(np.float32, copy=False),
-            gradient_variance=field.gradient_variance.astype(np.float32, copy=False),
+            **images,
             mask=field.variance < np.float32(max_variance_ratio * parameters.variance),
             origin=origin,
             resolution=float(resolution),

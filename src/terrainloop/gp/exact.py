@@ -31,8 +31,18 @@ ROUNDING = 1e-12
 MAX_POINTS = 20_000  # 3.2 GB a matrix
 
 
-def factorise(xy: Array, parameters: Hyperparameters, relative_noise: Array | float = 1.0) -> Array:
-    """Lower Cholesky factor (N, N) of K(X, X) + N, each point's noise being its share (N,) of the typical.
+def check_size(count: int) -> None:
+    """Refuse so many points that their covariance would not fit into memory."""
+    if count > MAX_POINTS:
+        raise TerrainLoopError(
+            expected=f"at most {MAX_POINTS} points for the dense process",
+            found=f"{count}, {8e-9 * count**2:.0f} GB a matrix",
+            mend="set max_points, or leave the solver at 'spline', which takes them all",
+        )
+
+
+def factorise(xy: Array, parameters: Hyperparameters, noise: Array | float) -> Array:
+    """Lower Cholesky factor (N, N) of K(X, X) + N, from the standard deviation of each point's noise (N,).
 
     Raises
     ------
@@ -43,7 +53,7 @@ def factorise(xy: Array, parameters: Hyperparameters, relative_noise: Array | fl
     covariance *= -0.5 / parameters.length_scale**2
     np.exp(covariance, out=covariance)
     covariance *= parameters.variance
-    covariance.flat[:: len(xy) + 1] += (parameters.noise * relative_noise) ** 2
+    covariance.flat[:: len(xy) + 1] += noise**2
     try:
         # The transpose of a symmetric matrix is itself, and LAPACK then works in place.
         return cholesky(covariance.T, lower=True, overwrite_a=True, check_finite=False)
@@ -69,7 +79,7 @@ def predict_grid(
     x: Array,
     y: Array,
     *,
-    relative_noise: Array | float = 1.0,
+    noise: Array | None = None,
     workers: int = 1,
 ) -> Prediction:
     """Posterior of the elevation and its gradient on the grid spanned by `x` and `y`.
@@ -83,8 +93,8 @@ def predict_grid(
     parameters : Hyperparameters
     x, y : array, (W,) and (H,)
         Grid coordinates, metres.
-    relative_noise : array, (N,)
-        Noise of each point as a share of ``parameters.noise``.
+    noise : array, (N,), optional
+        Standard deviation of each point's elevation, metres; ``parameters.noise`` if not given.
     workers : int
         Threads; the result does not depend on it.
 
@@ -98,14 +108,9 @@ def predict_grid(
     TerrainLoopError
         If the covariance cannot be factorised, or there are more points than fit into memory.
     """
-    if len(xy) > MAX_POINTS:
-        raise TerrainLoopError(
-            expected=f"at most {MAX_POINTS} points for the exact solver",
-            found=f"{len(xy)}, {8e-9 * len(xy) ** 2:.0f} GB a matrix",
-            mend="set max_points, or leave the solver at 'spline', which takes them all",
-        )
+    check_size(len(xy))
     with threadpool_limits(1, user_api="blas"):  # BLAS sums in another order with more threads
-        lower = factorise(xy, parameters, relative_noise)
+        lower = factorise(xy, parameters, parameters.noise if noise is None else noise)
         weights = parameters.variance * cho_solve((lower, True), elevation, check_finite=False)
         kx, dkx = factor(x, xy[:, 0], parameters.length_scale)
         ky, dky = factor(y, xy[:, 1], parameters.length_scale)

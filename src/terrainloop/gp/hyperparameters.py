@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from terrainloop import _core
 from terrainloop.errors import TerrainLoopError
-from terrainloop.gp.exact import factorise, invert
+from terrainloop.gp.exact import check_size, factorise, invert
 from terrainloop.gp.kernel import Array, Hyperparameters, squared_distances
 from terrainloop.gp.surface import Surface, surface_of
 from terrainloop.submap import Submap
@@ -57,7 +57,7 @@ def negative_log_likelihood(
         Noise of each point as a share of the typical one.
     """
     parameters = Hyperparameters(*np.exp(log_parameters).tolist())
-    lower = factorise(xy, parameters, relative_noise)
+    lower = factorise(xy, parameters, parameters.noise * relative_noise)
     weights = cho_solve((lower, True), elevation, check_finite=False)
     value = 0.5 * elevation @ weights + np.log(lower.diagonal()).sum() + 0.5 * len(xy) * np.log(2 * np.pi)
     sensitivity = invert(lower)
@@ -249,19 +249,14 @@ def _bounds(start: Hyperparameters, fixed: Sequence[str]) -> tuple[Array, Array]
 def maximise_likelihood(
     surfaces: Sequence[Surface], start: Hyperparameters, *, fixed: Sequence[str] = (), workers: int = 1
 ) -> Hyperparameters:
-    """Most likely hyperparameters by L-BFGS-B over their logarithms, all points being taken at once.
+    """As `fit_blocks`, by the likelihood of all points of a surface at once (see `negative_log_likelihood`).
 
-    Parameters
-    ----------
-    surfaces : sequence of Surface
-        Independent draws from one prior.
-    start : Hyperparameters
-        Where the search begins.
-    fixed : sequence of str
-        Names of the hyperparameters that keep their value.
-    workers : int
-        Threads; the result does not depend on it.
+    Raises
+    ------
+    TerrainLoopError
+        If there are more points than a dense covariance can have.
     """
+    check_size(max(len(surface.xy) for surface in surfaces))
     count = sum(len(surface.xy) for surface in surfaces)
 
     def per_point(log_parameters: Array) -> tuple[float, Array]:

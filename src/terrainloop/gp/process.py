@@ -118,14 +118,13 @@ class ElevationProcess:
         x = corner[0] + resolution * np.arange(shape[1])
         y = corner[1] + resolution * np.arange(shape[0])
         if self.solver == "exact":
-            ratio = self.noise / self.parameters.noise
             field = exact.predict_grid(
                 surface.xy,
                 surface.elevation,
                 self.parameters,
                 x,
                 y,
-                relative_noise=ratio,
+                noise=self.noise,
                 workers=self.workers,
             )
         else:

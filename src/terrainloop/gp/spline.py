@@ -5,6 +5,7 @@ covariance with which the spline is the process (docs/solver.md).
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,23 +58,8 @@ def predict_grid(
     TerrainLoopError
         If the equations cannot be solved to tolerance.
     """
-    maps = _solve(
-        lambda: _core.gp_predict_grid(
-            xy,
-            elevation,
-            noise,
-            length_scale=parameters.length_scale,
-            variance=parameters.variance,
-            x=origin[0],
-            y=origin[1],
-            resolution=resolution,
-            rows=shape[0],
-            cols=shape[1],
-            threads=workers,
-        ),
-        parameters,
-    )
-    return Prediction(*maps)
+    grid = {"x": origin[0], "y": origin[1], "resolution": resolution, "rows": shape[0], "cols": shape[1]}
+    return _solve(_core.gp_predict_grid, xy, elevation, noise, parameters, threads=workers, **grid)
 
 
 def predict_at(
@@ -86,19 +72,7 @@ def predict_at(
     workers: int = 1,
 ) -> Prediction:
     """Posterior at arbitrary places (Q, 2), metres; otherwise as `predict_grid`."""
-    maps = _solve(
-        lambda: _core.gp_predict_at(
-            xy,
-            elevation,
-            noise,
-            length_scale=parameters.length_scale,
-            variance=parameters.variance,
-            queries=queries,
-            threads=workers,
-        ),
-        parameters,
-    )
-    return Prediction(*maps)
+    return _solve(_core.gp_predict_at, xy, elevation, noise, parameters, threads=workers, queries=queries)
 
 
 def noise_ratio(xy: Array, elevation: Array, length_scale: float, *, workers: int = 1) -> Array:
@@ -131,10 +105,16 @@ def noise_ratio(xy: Array, elevation: Array, length_scale: float, *, workers: in
 
 
 def _solve(
-    solve: Callable[[], list[NDArray[np.float32]]], parameters: Hyperparameters
-) -> list[NDArray[np.float32]]:
+    predict: Callable[..., list[NDArray[np.float32]]],
+    xy: Array,
+    elevation: Array,
+    noise: Array,
+    parameters: Hyperparameters,
+    **places: Any,
+) -> Prediction:
+    prior = {"length_scale": parameters.length_scale, "variance": parameters.variance}
     try:
-        return solve()
+        return Prediction(*predict(xy, elevation, noise, **prior, **places))
     except RuntimeError as error:
         raise TerrainLoopError(
             expected="equations that can be solved in double precision",
