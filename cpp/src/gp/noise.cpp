@@ -4,6 +4,7 @@
 #include <stdexcept>
 #include <vector>
 
+#include "cells.hpp"
 #include "terrainloop/gp.hpp"
 #include "workers.hpp"
 
@@ -25,35 +26,16 @@ double median(std::vector<double>& values) {
   return *middle;
 }
 
-/// Points by cell: those of cell c are indices[first[c]] ... indices[first[c + 1] - 1].
-struct Cells {
-  int rows, cols;
-  std::vector<std::size_t> first, indices;
-  std::vector<int> of_point;
-};
-
-Cells sort_into_cells(const double* xy, std::size_t count, double side) {
+CellGrid cells_over(const double* xy, std::size_t count, double side) {
   double low[2] = {xy[0], xy[1]}, high[2] = {xy[0], xy[1]};
   for (std::size_t i = 0; i < 2 * count; ++i) {
     low[i % 2] = std::min(low[i % 2], xy[i]);
     high[i % 2] = std::max(high[i % 2], xy[i]);
   }
-  const double cols = std::floor((high[0] - low[0]) / side) + 1.0,
-               rows = std::floor((high[1] - low[1]) / side) + 1.0;
+  const double cols = std::floor((high[0] - low[0]) / side) + 1.0;
+  const double rows = std::floor((high[1] - low[1]) / side) + 1.0;
   if (!(rows * cols < 1e7)) throw std::invalid_argument("the extent must be below ten million cells");
-  Cells cells{static_cast<int>(rows), static_cast<int>(cols), {}, {}, std::vector<int>(count)};
-  cells.first.assign(static_cast<std::size_t>(cells.rows) * cells.cols + 1, 0);
-  for (std::size_t i = 0; i < count; ++i) {
-    const int col = static_cast<int>((xy[2 * i] - low[0]) / side),
-              row = static_cast<int>((xy[2 * i + 1] - low[1]) / side);
-    cells.of_point[i] = std::min(row, cells.rows - 1) * cells.cols + std::min(col, cells.cols - 1);
-    ++cells.first[cells.of_point[i] + 1];
-  }
-  for (std::size_t c = 1; c < cells.first.size(); ++c) cells.first[c] += cells.first[c - 1];
-  std::vector<std::size_t> next(cells.first.begin(), cells.first.end() - 1);
-  cells.indices.resize(count);
-  for (std::size_t i = 0; i < count; ++i) cells.indices[next[cells.of_point[i]]++] = i;
-  return cells;
+  return {low[0], low[1], side, static_cast<int>(rows), static_cast<int>(cols)};
 }
 
 /// Distances of some points from the plane that most of them lie on, and their robust standard deviation.
@@ -113,13 +95,14 @@ void noise_ratio(const double* xy, const double* elevation, std::size_t count, d
                  int threads) {
   if (!(cell > 0.0) || count == 0)
     throw std::invalid_argument("there must be points and a positive cell size");
-  const Cells cells = sort_into_cells(xy, count, cell);
-  Eigen::ArrayXXd variance = Eigen::ArrayXXd::Zero(cells.cols, cells.rows), known = variance;
+  const CellGrid grid = cells_over(xy, count, cell);
+  const SortedCells cells = sort_into_cells(xy, count, grid);
+  Eigen::ArrayXXd variance = Eigen::ArrayXXd::Zero(grid.cols, grid.rows), known = variance;
   std::vector<double> residuals(count, 0.0);
   Workers workers(threads);
-  workers.run(cells.rows, [&](int row) {
-    for (int col = 0; col < cells.cols; ++col) {
-      const std::size_t c = static_cast<std::size_t>(row) * cells.cols + col;
+  workers.run(grid.rows, [&](int row) {
+    for (int col = 0; col < grid.cols; ++col) {
+      const std::size_t c = static_cast<std::size_t>(row) * grid.cols + col;
       if (cells.first[c + 1] - cells.first[c] < kFewest) continue;
       const double deviation = scatter(xy, elevation, &cells.indices[cells.first[c]],
                                        &cells.indices[0] + cells.first[c + 1], cell, residuals.data());
@@ -131,7 +114,7 @@ void noise_ratio(const double* xy, const double* elevation, std::size_t count, d
   std::vector<double> told;
   for (std::size_t i = 0; i < count; ++i)
     if (known(cells.of_point[i]) > 0.0) told.push_back(deviation(cells.of_point[i]));
-  const Cells patches = sort_into_cells(xy, count, cell / kPatches);
+  const SortedCells patches = sort_into_cells(xy, count, cells_over(xy, count, cell / kPatches));
   for (std::size_t i = 0; i < count; ++i)
     ratio[i] = std::sqrt(patches.first[patches.of_point[i] + 1] - patches.first[patches.of_point[i]]);
   if (told.size() < kEnough * count) return;

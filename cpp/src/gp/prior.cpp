@@ -27,13 +27,13 @@ double spline_spectrum(double w) {
 
 std::vector<double> weight_covariance(int count) {
   const int samples = 2 * count + 256;  // the trapezoid rule: the error falls as 0.54^256
-  std::vector<double> covariance(count, 0.0);
+  std::vector<double> covariance(count, 0.0), cosine(samples);
+  for (int m = 0; m < samples; ++m) cosine[m] = std::cos(2.0 * kPi * m / samples);
   for (int m = 0; m < samples; ++m) {
     const double w = 2.0 * kPi * m / samples;
     const double folded = m > samples / 2 ? w - 2.0 * kPi : w;
     const double spectrum = kernel_spectrum(folded) / std::pow(spline_spectrum(w), 2) / samples;
-    for (int n = 0; n < count; ++n)
-      covariance[n] += spectrum * std::cos(2.0 * kPi * ((static_cast<long>(m) * n) % samples) / samples);
+    for (int n = 0; n < count; ++n) covariance[n] += spectrum * cosine[static_cast<long>(m) * n % samples];
   }
   return covariance;
 }

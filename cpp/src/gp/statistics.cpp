@@ -2,6 +2,9 @@
 
 #include <algorithm>
 #include <cmath>
+#include <utility>
+
+#include "cells.hpp"
 
 namespace terrainloop::gp {
 namespace {
@@ -62,27 +65,16 @@ void add_turns(const double* products, double* entries, int stride) {
 }  // namespace
 
 BinnedPoints bin(const Points& points, const Lattice& lattice) {
-  const auto cell_of = [&](std::size_t i, double& u, double& v) -> long {
-    u = (points.xy[2 * i] - lattice.x) / lattice.spacing;
-    v = (points.xy[2 * i + 1] - lattice.y) / lattice.spacing;
-    if (!(u >= 0.0 && v >= 0.0 && u <= lattice.cols && v <= lattice.rows)) return -1;
-    const int col = std::min(static_cast<int>(u), lattice.cols - 1);
-    const int row = std::min(static_cast<int>(v), lattice.rows - 1);
-    u -= col;
-    v -= row;
-    return static_cast<long>(row) * lattice.cols + col;
-  };
-  BinnedPoints binned;
-  binned.first.assign(static_cast<std::size_t>(lattice.rows) * lattice.cols + 1, 0);
-  double u, v;
-  for (std::size_t i = 0; i < points.count; ++i)
-    if (const long cell = cell_of(i, u, v); cell >= 0) ++binned.first[cell + 1];
-  for (std::size_t cell = 1; cell < binned.first.size(); ++cell) binned.first[cell] += binned.first[cell - 1];
-  binned.points.resize(binned.first.back());
-  std::vector<std::size_t> next(binned.first.begin(), binned.first.end() - 1);
-  for (std::size_t i = 0; i < points.count; ++i)
-    if (const long cell = cell_of(i, u, v); cell >= 0)
-      binned.points[next[cell]++] = {u, v, points.elevation[i], 1.0 / (points.noise[i] * points.noise[i])};
+  SortedCells cells = sort_into_cells(points.xy, points.count,
+                                      {lattice.x, lattice.y, lattice.spacing, lattice.rows, lattice.cols});
+  BinnedPoints binned{{}, std::move(cells.first)};
+  binned.points.reserve(cells.indices.size());
+  for (const std::size_t i : cells.indices) {
+    const int row = cells.of_point[i] / lattice.cols, col = cells.of_point[i] % lattice.cols;
+    binned.points.push_back({(points.xy[2 * i] - lattice.x) / lattice.spacing - col,
+                             (points.xy[2 * i + 1] - lattice.y) / lattice.spacing - row, points.elevation[i],
+                             1.0 / (points.noise[i] * points.noise[i])});
+  }
   return binned;
 }
 
