@@ -23,8 +23,23 @@ RESOLUTION = 0.1
 STRICT = Settings(
     map=MapSettings(max_points=900, length_scale=0.4, noise=0.01, resolution=RESOLUTION),
     features=FeatureSettings(kind="sift", max_keypoints=300),
-    match=MatchSettings(iterations=2000, inlier_radius=0.2, min_inliers=10, max_ssd_ratio=0.6),
+    match=MatchSettings(
+        decision="evidence",
+        max_false_loops=0.01,
+        iterations=2000,
+        inlier_radius=0.2,
+        min_inliers=10,
+        max_ssd_ratio=0.6,
+    ),
 )
+
+
+def with_match(settings, **changes):
+    """Settings that match in another way."""
+    return settings.model_copy(update={"match": MatchSettings(**settings.match.model_dump() | changes)})
+
+
+BY_INLIERS = with_match(STRICT, decision="inliers")
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,17 +84,21 @@ class World:
 
     def map(self, T_planar=None, *, origin=(-2.0, -2.5), shape=(60, 50), resolution=0.08):
         """The gradient map of a frame with SE(2) pose `T_planar`, from the closed form: no GP, no noise."""
-        T = np.eye(3) if T_planar is None else T_planar
-        rows, columns = np.indices(shape)
-        local = np.stack([columns, rows], axis=-1).reshape(-1, 2) * resolution + origin
-        xy = transform(T, local)
-        height, slope = self._height_and_slope(xy)
-        slope = slope @ T[:2, :2]  # T's inverse rotation, from the right
-        images = [v.reshape(shape).astype(np.float32) for v in (height, *slope.T)]
-        variance = np.full(shape, 1e-4, np.float32)
-        return GradientMap(
-            *images, variance, 6 * variance, np.ones(shape, bool), tuple(origin), resolution, PARAMETERS
-        )
+        return map_of(self._height_and_slope, T_planar, origin=origin, shape=shape, resolution=resolution)
+
+
+def map_of(height_and_slope, T_planar=None, *, origin=(-2.0, -2.5), shape=(60, 50), resolution=0.08):
+    """The gradient map of ground whose heights (N,) and slopes (N, 2) are a function of positions (N, 2)."""
+    T = np.eye(3) if T_planar is None else T_planar
+    rows, columns = np.indices(shape)
+    local = np.stack([columns, rows], axis=-1).reshape(-1, 2) * resolution + origin
+    height, slope = height_and_slope(transform(T, local))
+    slope = slope @ T[:2, :2]  # T's inverse rotation, from the right
+    images = [v.reshape(shape).astype(np.float32) for v in (height, *slope.T)]
+    variance = np.full(shape, 1e-4, np.float32)
+    return GradientMap(
+        *images, variance, 6 * variance, np.ones(shape, bool), tuple(origin), resolution, PARAMETERS
+    )
 
 
 @pytest.fixture(scope="session")
@@ -91,6 +110,12 @@ def world():
 @pytest.fixture(scope="session")
 def strict():
     return STRICT
+
+
+@pytest.fixture(scope="session")
+def by_inliers():
+    """The tests' own thresholds for the paper's decision."""
+    return BY_INLIERS
 
 
 @pytest.fixture(scope="session")

@@ -1,10 +1,13 @@
 """The detector: loops of a revisit, its database, and whole missions with a broken cloud."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from conftest import BROKEN, PLACES
 
 from terrainloop.config import MatchSettings
+from terrainloop.detection import detector as detecting
 from terrainloop.detection.detector import LoopDetector, fit_database, map_submap
 from terrainloop.detection.mission import detect_mission
 from terrainloop.errors import TerrainLoopError
@@ -12,6 +15,7 @@ from terrainloop.geometry import parameters_of, transform
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.io.missions import load_mission
 from terrainloop.io.results import write_loops, write_submaps
+from terrainloop.loop import LoopCandidate
 from terrainloop.submap import Submap
 
 PARAMETERS = Hyperparameters(0.4, 0.01, 0.011)
@@ -141,6 +145,49 @@ def test_a_submap_that_cannot_be_mapped_leaves_the_detector_as_it_was(submaps, s
     assert detector.submaps == {}
     assert detector.candidates == []
     assert detector.parameters is None
+
+
+@pytest.fixture
+def told(monkeypatch):
+    """Compares nothing; keeps what each query was told of the number of pairs."""
+    kept = {}
+
+    def compare(source, target, settings, *, pairs):
+        kept.setdefault(source.name, []).append(pairs)
+        return LoopCandidate.without_transform(source.name, target.name, "not compared")
+
+    monkeypatch.setattr(detecting, "compare", compare)
+    return kept
+
+
+@pytest.mark.parametrize("skip", [0, 3])
+def test_however_long_it_runs_max_false_loops_is_shared_out_once(told, strict, skip):
+    """Each pair may spend 1 / pairs of it; all of them together one whole, and nearly that."""
+    detector = LoopDetector(strict.model_copy(update={"skip_recent": skip}), workers=2)
+    for number in range(60):
+        detector.add_mapped(SimpleNamespace(name=str(number)))
+    assert [len(pairs) for pairs in told.values()] == list(range(1, 60 - skip))
+    assert all(len(set(pairs)) == 1 for pairs in told.values())  # alike for all of a query
+    shares = np.array([sum(1 / n for n in pairs) for pairs in told.values()])
+    assert 0.95 < shares.sum() <= 1.0
+    assert (np.diff(shares) < 0).all()
+
+
+def test_expected_pairs_share_max_false_loops_evenly(told, strict):
+    detector = LoopDetector(strict, expected_pairs=77)
+    for number in range(10):
+        detector.add_mapped(SimpleNamespace(name=str(number)))
+    assert {n for pairs in told.values() for n in pairs} == {77}
+
+
+@pytest.mark.parametrize("skip", [0, 1, 2, 3, 99])
+def test_a_mission_knows_its_pairs(told, mission_folder, strict, skip):
+    thin = strict.map.model_copy(update={"max_points": 100, "resolution": 0.5})
+    settings = strict.model_copy(update={"map": thin, "skip_recent": skip})
+    detector, _ = detect_mission(load_mission(mission_folder), settings)
+    compared = [n for pairs in told.values() for n in pairs]
+    assert len(compared) == len(detector.candidates) == sum(range(len(WHOLE) - skip))
+    assert all(n == len(compared) for n in compared)
 
 
 @pytest.fixture(scope="module")

@@ -36,6 +36,8 @@ def _candidates():
         inliers=np.int64(17),
         accepted=np.bool_(True),
         reason='17 inliers, "sure"\nand certain',
+        found_by="dense",
+        correlation=0.1 + 0.2,
         **common,
     )
     none = LoopCandidate(
@@ -86,10 +88,12 @@ def test_loops_keep_the_contract(tmp_path):
         "cov_x_yaw",
         "cov_y_y",
     ]
-    assert names[14 + 20 :] == ["cov_yaw_yaw", "ssd_ratio"]
+    assert names[14 + 20 :] == ["cov_yaw_yaw", "ssd_ratio", "found_by", "correlation"]
     assert (rows[0]["accepted"], rows[1]["accepted"]) == ("true", "false")
     assert (rows[0]["inliers"], rows[0]["score"], rows[0]["ssd"]) == ("17", "12.000000000000002", str(1 / 3))
+    assert (rows[0]["found_by"], rows[0]["correlation"]) == ("dense", "0.30000000000000004")
     assert (rows[1]["cov_x_x"], rows[1]["ssd"]) == ("nan", "inf")
+    assert (rows[1]["found_by"], rows[1]["correlation"]) == ("", "nan")
     assert float(rows[0]["ty_m"]) == UTM[1]
     assert float(rows[0]["yaw_rad"]) == pytest.approx(3.0, abs=1e-15)
     assert float(rows[0]["cov_y_yaw"]) == _candidates()[0].covariance[1, 5]

@@ -1,21 +1,23 @@
-"""Associations, Algorithm 1, its SSD, and the whole of `register`, against naive versions and known truth."""
+"""Associations, Algorithm 1, its SSD, the pose, and `register`, against naive versions and known truth."""
 
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import BY_INLIERS, STRICT, with_match
 from scipy.ndimage import map_coordinates
 
-from terrainloop.config import MatchSettings
 from terrainloop.features import Features
 from terrainloop.geometry import fit_se2, inverse, parameters_of, se2, se3, transform, yaw_of
 from terrainloop.gradient_map import GradientMap
+from terrainloop.matching.by_inliers import align
 from terrainloop.matching.correspondences import Associations, associate
-from terrainloop.matching.lift import lift_to_se3
+from terrainloop.matching.lift import covariance_of_inliers, lift_to_se3
+from terrainloop.matching.mapped import MappedSubmap
 from terrainloop.matching.ransac import get_inliers, register_by_ransac, select_random_associations
 from terrainloop.matching.refine import refine
-from terrainloop.matching.register import align, features_of, register
+from terrainloop.matching.register import compare, register
 from terrainloop.matching.ssd import compute_ssd, warp
 
 UTM = np.array([5e5, 4e6, 0.0])
@@ -391,16 +393,21 @@ def maps(clouds, gp_map):
     return made
 
 
+@pytest.fixture(params=[STRICT, BY_INLIERS], ids=["evidence", "inliers"])
+def either(request):
+    """Settings for the one decision and the other."""
+    return request.param
+
+
 def errors(T, name, clouds):
     """At the middle of the source, in metres; and of roll, pitch and yaw, radians."""
     true, middle = PLACES[name].T, clouds[name].mean(axis=0)
     return transform(T, middle) - transform(true, middle), (parameters_of(T) - parameters_of(true))[3:]
 
 
-@pytest.mark.parametrize("own_settings", [True, False], ids=["test settings", "defaults"])
+@pytest.mark.parametrize("settings", [STRICT, BY_INLIERS, None], ids=["evidence", "inliers", "defaults"])
 @pytest.mark.parametrize("name", SEEN_TWICE)
-def test_register_finds_the_transform(maps, clouds, strict, name, own_settings):
-    settings = strict if own_settings else None
+def test_register_finds_the_transform(maps, clouds, name, settings):
     loop = register(maps[name], maps["target"], settings, names=("b", "a"))
     assert loop
     assert loop.accepted
@@ -420,16 +427,16 @@ def test_register_finds_the_transform(maps, clouds, strict, name, own_settings):
 
 
 @pytest.mark.parametrize("name", SEEN_TWICE)
-def test_register_measures_the_overlap(maps, strict, name):
+def test_register_measures_the_overlap(maps, either, name):
     """Two squares of 5 m, 0.7 and 0.5 m apart; the maps' rectangles and margins differ a little."""
-    loop = register(maps[name], maps["target"], strict)
+    loop = register(maps[name], maps["target"], either)
     shared = 4.3 * 4.5
     assert loop.overlap == pytest.approx(shared / (50 - shared), abs=0.06)
 
 
 @pytest.mark.parametrize("name", SEEN_TWICE)
-def test_covariance_is_one_and_fits_the_error(maps, clouds, strict, name):
-    loop = register(maps[name], maps["target"], strict)
+def test_covariance_is_one_and_fits_the_error(maps, clouds, either, name):
+    loop = register(maps[name], maps["target"], either)
     covariance = loop.covariance
     np.testing.assert_allclose(covariance, covariance.T, rtol=1e-10, atol=1e-16)
     assert np.linalg.eigvalsh(covariance).min() > 0
@@ -448,11 +455,12 @@ def test_covariance_is_calibrated_over_many_places(world):
     source, target, values = world(0).map(T), world(0).map(), []
     for seed in range(100):
         rng = np.random.default_rng(seed)
-        keypoints = rng.uniform(-1.5, 1.5, (20, 2))
+        keypoints, pivot = rng.uniform(-1.5, 1.5, (20, 2)), rng.uniform(-1, 1, 2)
         matched = transform(T, keypoints) + rng.normal(0, 0.05, (20, 2))
         estimate = fit_se2(keypoints, matched)
         moved = transform(estimate, keypoints)
-        lifted, covariance = lift_to_se3(source, target, estimate, moved, moved - matched)
+        planar = covariance_of_inliers(moved - pivot, moved - matched, floor=1e-3)
+        lifted, covariance = lift_to_se3(source, target, estimate, pivot, planar)
         error = (parameters_of(lifted) - [0.5, -0.3, 0, 0, 0, 2.0])[[0, 1, 5]]
         planar = covariance[np.ix_([0, 1, 5], [0, 1, 5])]
         values.append(error @ np.linalg.solve(planar, error))
@@ -470,8 +478,8 @@ def test_lift_finds_height_and_tilt(world, tilt, yaw):
     target = GradientMap.from_points(np.c_[xy[0], world(0).height(xy[0])], **options)
     seen = transform(inverse(T), np.c_[xy[1], world(0).height(xy[1])])
     source = GradientMap.from_points(seen, **options)
-    keypoints = np.array([[-1.0, -1], [1, -1], [0, 1]])
-    lifted, covariance = lift_to_se3(source, target, se2(0.2, -0.1, yaw), keypoints, 0.01 * keypoints)
+    planar = np.diag([0.01, 0.01, 0.01]) ** 2
+    lifted, covariance = lift_to_se3(source, target, se2(0.2, -0.1, yaw), np.array([0.3, 0.5]), planar)
     # A tilt moves ground at height z sideways by z times the tilt, which the planar fit cannot tell.
     np.testing.assert_allclose(parameters_of(lifted)[[0, 1]], [0.2, -0.1], rtol=0, atol=0.05)
     assert parameters_of(lifted)[2] == pytest.approx(0.7, abs=0.005)
@@ -481,33 +489,33 @@ def test_lift_finds_height_and_tilt(world, tilt, yaw):
 
 def test_lift_without_shared_ground_leaves_height_and_tilt_open(world):
     T = se2(100.0, 0.0, 0.3)
-    lifted, covariance = lift_to_se3(world(0).map(), world(0).map(), T, np.ones((3, 2)), np.zeros((3, 2)))
+    lifted, covariance = lift_to_se3(world(0).map(), world(0).map(), T, np.ones(2), np.eye(3))
     np.testing.assert_allclose(lifted, se3(100.0, 0.0, 0.0, 0.0, 0.0, 0.3), rtol=0, atol=1e-12)
     assert np.isnan(covariance).all()
 
 
-@pytest.mark.parametrize("own_settings", [True, False], ids=["test settings", "defaults"])
+@pytest.mark.parametrize("settings", [STRICT, BY_INLIERS, None], ids=["evidence", "inliers", "defaults"])
 @pytest.mark.parametrize("name", ["elsewhere", "elsewhere again"])
-def test_register_rejects_unrelated_ground(maps, strict, name, own_settings):
+def test_register_rejects_unrelated_ground(maps, name, settings):
     for source, target in ((name, "target"), ("target", name)):
-        candidate = register(maps[source], maps[target], strict if own_settings else None)
+        candidate = register(maps[source], maps[target], settings)
         assert not candidate
         assert candidate.accepted is False
         assert len(candidate.reason.split()) > 3
 
 
-@pytest.mark.parametrize("own_settings", [True, False], ids=["test settings", "defaults"])
-def test_register_rejects_flat_ground(maps, strict, own_settings):
-    candidate = register(maps["flat 1"], maps["flat 2"], strict if own_settings else None)
+@pytest.mark.parametrize("settings", [STRICT, BY_INLIERS, None], ids=["evidence", "inliers", "defaults"])
+def test_register_rejects_flat_ground(maps, settings):
+    candidate = register(maps["flat 1"], maps["flat 2"], settings)
     assert not candidate
     assert candidate.reason
 
 
-def test_maps_without_a_feature_are_rejected(world, strict):
+def test_maps_without_a_feature_are_rejected(world, either):
     nothing = world(0).map()
     nothing = replace(nothing, mask=np.zeros_like(nothing.mask))
     for source, target in ((nothing, world(0).map()), (world(0).map(), nothing), (nothing, nothing)):
-        candidate = register(source, target, strict)
+        candidate = register(source, target, either)
         assert not candidate
         assert np.isnan(candidate.T_target_source).all()
         assert np.isnan(candidate.covariance).all()
@@ -515,13 +523,12 @@ def test_maps_without_a_feature_are_rejected(world, strict):
         assert candidate.covariance.shape == (6, 6)
         assert candidate.inliers == 0
         assert candidate.overlap == 0.0
-        assert "association" in candidate.reason
+        assert ("association" if either is BY_INLIERS else "ground") in candidate.reason
 
 
-def test_rejection_names_what_failed(maps, strict):
+def test_rejection_by_inliers_names_what_failed(maps):
     def because(**changes):
-        match = MatchSettings(**strict.match.model_dump() | changes)
-        return register(maps["same direction"], maps["target"], strict.model_copy(update={"match": match}))
+        return register(maps["same direction"], maps["target"], with_match(BY_INLIERS, **changes))
 
     assert because()
     few, differ = because(min_inliers=1000), because(max_ssd_ratio=1e-9)
@@ -535,9 +542,9 @@ def test_rejection_names_what_failed(maps, strict):
 
 
 @pytest.mark.parametrize("name", SEEN_TWICE)
-def test_utm_clouds_have_their_transform_in_their_own_frames(maps, strict, name):
-    loop = register(maps[name], maps["target"], strict)
-    far = register(maps["utm " + name], maps["utm target"], strict)
+def test_utm_clouds_have_their_transform_in_their_own_frames(maps, either, name):
+    loop = register(maps[name], maps["target"], either)
+    far = register(maps["utm " + name], maps["utm target"], either)
     assert far
     expected = SHIFT @ loop.T_target_source @ inverse(SHIFT)
     middle = np.array([*UTM[:2], 0.0])
@@ -551,11 +558,11 @@ def test_utm_clouds_have_their_transform_in_their_own_frames(maps, strict, name)
     assert far.overlap == pytest.approx(loop.overlap, abs=0.01)
 
 
-def test_utm_covariance_is_the_local_one_carried_along(maps, strict):
+def test_utm_covariance_is_the_local_one_carried_along(maps, either):
     """By finite differences of the transform between the frames that T_target_source undergoes."""
     name = "same direction"
-    loop = register(maps[name], maps["target"], strict)
-    far = register(maps["utm " + name], maps["utm target"], strict)
+    loop = register(maps[name], maps["target"], either)
+    far = register(maps["utm " + name], maps["utm target"], either)
 
     def carried(parameters):
         return parameters_of(SHIFT @ se3(*parameters) @ inverse(SHIFT))
@@ -573,44 +580,48 @@ def test_utm_covariance_is_the_local_one_carried_along(maps, strict):
     assert (np.abs(error) < 5 * np.sqrt(np.diag(far.covariance))).all()
 
 
-def test_register_gives_the_same_bytes_again(maps, strict):
-    one, two = (register(maps["same direction"], maps["target"], strict) for _ in range(2))
+def test_register_gives_the_same_bytes_again(maps, either):
+    one, two = (register(maps["same direction"], maps["target"], either) for _ in range(2))
     assert one.T_target_source.tobytes() == two.T_target_source.tobytes()
     assert one.covariance.tobytes() == two.covariance.tobytes()
     assert one.reason == two.reason
 
 
-def test_known_features_change_nothing(maps, strict):
-    source, target = maps["opposite direction"], maps["target"]
-    known = register(
-        source, target, strict,
-        source_features=features_of(source, strict), target_features=features_of(target, strict),
-    )  # fmt: skip
-    assert known.T_target_source.tobytes() == register(source, target, strict).T_target_source.tobytes()
+def test_compare_is_register_of_what_is_mapped(maps, either):
+    pair = {"b": maps["opposite direction"], "a": maps["target"]}
+    known = compare(
+        *(MappedSubmap.of(name, gradient_map, either) for name, gradient_map in pair.items()), either
+    )
+    loop = register(*pair.values(), either, names=("b", "a"))
+    assert (known.source, known.target) == ("b", "a")
+    assert known.T_target_source.tobytes() == loop.T_target_source.tobytes()
+    assert known.covariance.tobytes() == loop.covariance.tobytes()
 
 
-def test_draws_hang_on_seed_and_names(maps, strict):
+def test_draws_hang_on_seed_and_names(maps):
     """Other draws, another subset of inliers perhaps; the same names and seed, the same draws."""
-    source, target = maps["same direction"], maps["target"]
-    few = strict.model_copy(update={"match": MatchSettings(**strict.match.model_dump() | {"iterations": 3})})
-    associations = associate(features_of(source, few), features_of(target, few))
+    few = with_match(BY_INLIERS, iterations=3)
+    source, target = (MappedSubmap.of("", maps[name], few) for name in ("same direction", "target"))
+    associations = associate(source.features, target.features)
 
     def inliers(seed, names):
-        found = align(source, target, associations, few.model_copy(update={"seed": seed}), names)
+        named = (replace(submap, name=name) for submap, name in zip((source, target), names, strict=True))
+        found = align(*named, associations, few.model_copy(update={"seed": seed}))
         return b"" if found is None else found.inliers.tobytes()
 
     assert inliers(0, ("a", "b")) == inliers(0, ("a", "b"))
     assert len({inliers(seed, ("a", "b")) for seed in range(8)}) > 1
     assert len({inliers(0, (name, "b")) for name in "abcdefgh"}) > 1
+    assert len({inliers(0, ("a", name)) for name in "abcdefgh"}) > 1
 
 
 @pytest.mark.parametrize("kind", ["surf", "sift", "orb"])
-def test_every_kind_of_feature_can_close_the_loop(world, strict, kind):
-    features_settings = strict.features.model_copy(update={"kind": kind, "max_keypoints": 500})
+def test_every_kind_of_feature_can_close_the_loop(world, by_inliers, kind):
+    features_settings = by_inliers.features.model_copy(update={"kind": kind, "max_keypoints": 500})
     T = se2(0.4, -0.3, np.radians(25.0))
     size = {"origin": (-3.0, -3.0), "shape": (120, 120), "resolution": 0.05}
     source, target = world(0).map(T, **size), world(0).map(**size)
-    loop = register(source, target, strict.model_copy(update={"features": features_settings}))
+    loop = register(source, target, by_inliers.model_copy(update={"features": features_settings}))
     assert loop
     middle = np.zeros(3)
     assert transform(loop.T_target_source, middle)[:2] == pytest.approx([0.4, -0.3], abs=0.05)
@@ -623,7 +634,7 @@ def test_refinement_finds_the_pose_of_the_field(world, offset):
     target = world(0).map()
     T_world_source = se2(0.4, -0.3, 0.7)
     source = world(0).map(T_world_source)
-    refined = refine(source, target, se2(*offset) @ T_world_source)
+    refined = refine(source, target, se2(*offset) @ T_world_source).T_target_source
     error = inverse(T_world_source) @ refined
     assert np.hypot(*error[:2, 2]) < 2e-3
     assert abs(yaw_of(error)) < 1e-3
@@ -636,12 +647,11 @@ def test_refinement_is_not_drawn_by_tilt_and_outliers(world):
     boulder = np.zeros(source.mask.shape, np.float32)
     boulder[20:26, 20:26] = 1.5
     disturbed = replace(source, gradient_x=source.gradient_x + 0.05 + boulder)
-    refined = refine(disturbed, target, se2(0.05, 0.05, 0.02) @ T_world_source)
+    refined = refine(disturbed, target, se2(0.05, 0.05, 0.02) @ T_world_source).T_target_source
     error = inverse(T_world_source) @ refined
     assert np.hypot(*error[:2, 2]) < 1e-2
     assert abs(yaw_of(error)) < 5e-3
 
 
-def test_refinement_leaves_maps_that_share_nothing(world):
-    far = se2(100.0, 0.0, 0.3)
-    np.testing.assert_array_equal(refine(world(0).map(), world(0).map(), far), far)
+def test_maps_that_share_nothing_are_not_refined(world):
+    assert refine(world(0).map(), world(0).map(), se2(100.0, 0.0, 0.3)) is None

@@ -56,17 +56,23 @@ class FeatureSettings(_Frozen):
 
 
 class MatchSettings(_Frozen):
-    """Algorithm 1: SE(2) RANSAC and its acceptance."""
+    """How two maps are compared, and what makes a loop."""
 
-    iterations: int = Field(5000, ge=1, description="pairs of associations drawn")
+    decision: Literal["evidence", "inliers"] = Field(
+        "evidence", description="evidence: false alarms expected by chance; inliers: Algorithm 1 of the paper"
+    )
+    max_false_loops: float = Field(
+        0.01, gt=0, description="evidence: false loops to be expected in a whole mission"
+    )
+    iterations: int = Field(5000, ge=1, description="pairs of keypoint associations drawn")
     inlier_radius: float | None = Field(
         None, gt=0, description="largest distance of an inlier, m; null: half the length scale"
     )
-    min_inliers: int = Field(5, ge=2, description="inliers that make a loop (n_min)")
+    min_inliers: int = Field(5, ge=2, description="inliers: as many make a loop (n_min)")
     max_ssd_ratio: float = Field(
-        0.5, gt=0, description="largest SSD, as a share of what unrelated ground would give"
+        0.5, gt=0, description="inliers: largest SSD, as a share of what unrelated ground would give"
     )
-    refine: bool = Field(True, description="settle the pose on the gradients of all shared ground")
+    refine: bool = Field(True, description="inliers: settle the pose on the gradients of all shared ground")
 
 
 class Settings(_Frozen):
@@ -102,7 +108,7 @@ class Settings(_Frozen):
                     remove_plane=False,
                 ),
                 features=FeatureSettings(kind="surf"),
-                match=MatchSettings(inlier_radius=0.09, max_ssd_ratio=1.0, refine=False),
+                match=MatchSettings(decision="inliers", inlier_radius=0.09, max_ssd_ratio=1.0, refine=False),
             )
         raise TerrainLoopError(
             expected="preset 'default' or 'paper'", found=repr(name), mend="name one of the two"

@@ -28,11 +28,16 @@ class LoopCandidate:
     overlap : float
         Shared part of the two maps' known ground, intersection over union, 0 to 1.
     score : float
-        Higher is surer; comparable across the pairs of a mission: the inliers, discounted by the
-        share of the gradients that they leave unexplained, n (1 - ssd_ratio).
+        Higher is surer; comparable across pairs. By evidence: minus the decimal logarithm of the false
+        alarms that one pair would yield by chance. By inliers: these, discounted by the share of the
+        gradients that they leave unexplained, n (1 - ssd_ratio).
     accepted : bool
     reason : str
         In words, why it was accepted or not.
+    found_by : {"dense", "sparse", ""}
+        What proposed the pose: the search of all poses, or the keypoints.
+    correlation : float
+        Of the two gradient fields over the shared ground, -1 to 1; NaN where it was not computed.
     """
 
     source: str
@@ -46,6 +51,25 @@ class LoopCandidate:
     score: float
     accepted: bool
     reason: str
+    found_by: str = ""
+    correlation: float = np.nan
+
+    @classmethod
+    def without_transform(cls, source: str, target: str, reason: str, score: float = 0.0) -> "LoopCandidate":
+        """A pair that was rejected before a transform could be estimated."""
+        return cls(
+            source=source,
+            target=target,
+            T_target_source=np.full((4, 4), np.nan),
+            covariance=np.full((6, 6), np.nan),
+            inliers=0,
+            ssd=np.nan,
+            ssd_ratio=np.nan,
+            overlap=0.0,
+            score=score,
+            accepted=False,
+            reason=reason,
+        )
 
     def __bool__(self) -> bool:
         return self.accepted

@@ -22,8 +22,8 @@ from terrainloop.cli.terminal import (
 
 if TYPE_CHECKING:
     from terrainloop.config import Settings
-    from terrainloop.detection.detector import MappedSubmap
     from terrainloop.loop import LoopCandidate
+    from terrainloop.matching.mapped import MappedSubmap
 
 
 def command(
@@ -41,7 +41,7 @@ def command(
     """Match cloud A against cloud B: a loop closure or not, and the transform from A to B."""
     from terrainloop.detection.detector import fit_database, map_submap
     from terrainloop.io.clouds import read_cloud
-    from terrainloop.matching.register import register
+    from terrainloop.matching.register import compare
 
     terminal = Terminal.open(as_json, quiet, verbose)
     settings = read_settings(preset, config, seed)
@@ -54,14 +54,7 @@ def command(
         for done, submap in enumerate(submaps, start=1):
             mapped.append(map_submap(submap, settings, parameters, workers=worker_count(workers)))
             progress("maps", done, 2)
-    candidate = register(
-        mapped[0].gradient_map,
-        mapped[1].gradient_map,
-        settings,
-        source_features=mapped[0].features,
-        target_features=mapped[1].features,
-        names=(mapped[0].name, mapped[1].name),
-    )
+    candidate = compare(mapped[0], mapped[1], settings)
     if figure is not None:
         draw(mapped[0], mapped[1], candidate, settings, figure)
     terminal.result(_summary(candidate), lambda console: _show(console, candidate))
@@ -75,14 +68,16 @@ def draw(
     path: Path,
 ) -> None:
     """The picture of a pair that was compared."""
+    from terrainloop.geometry import se2, yaw_of
     from terrainloop.matching.correspondences import associate
-    from terrainloop.matching.register import align
+    from terrainloop.matching.ransac import get_inliers, inlier_radius_of
     from terrainloop.report.figures import figure_match, save_figure
 
     associations = associate(source.features, target.features)
-    names = (candidate.source, candidate.target)
-    alignment = align(source.gradient_map, target.gradient_map, associations, settings, names)
-    inliers = np.zeros(len(associations), dtype=bool) if alignment is None else alignment.inliers
+    T = candidate.T_target_source
+    planar = se2(T[0, 3], T[1, 3], yaw_of(T))
+    radius = inlier_radius_of(settings, target.gradient_map)
+    inliers = get_inliers(associations, planar[None], radius)[0]
     save_figure(
         figure_match(source.gradient_map, target.gradient_map, candidate, associations, inliers), path
     )
@@ -101,6 +96,8 @@ def _summary(candidate: "LoopCandidate") -> dict[str, Any]:
         "ssd_ratio": candidate.ssd_ratio,
         "overlap": candidate.overlap,
         "score": candidate.score,
+        "found_by": candidate.found_by,
+        "correlation": candidate.correlation,
     }
 
 

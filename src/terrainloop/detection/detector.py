@@ -2,27 +2,17 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 
 from terrainloop.config import Settings
 from terrainloop.errors import TerrainLoopError
-from terrainloop.features import Features
 from terrainloop.gp.hyperparameters import fit_hyperparameters
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
-from terrainloop.matching.register import features_of, register
+from terrainloop.matching.mapped import MappedSubmap
+from terrainloop.matching.register import compare
 from terrainloop.submap import Submap
-
-
-@dataclass(frozen=True, eq=False)
-class MappedSubmap:
-    """What is kept of a submap: its gradient map and the keypoints on it."""
-
-    name: str
-    gradient_map: GradientMap
-    features: Features
 
 
 class LoopDetector:
@@ -33,6 +23,9 @@ class LoopDetector:
     settings : Settings, optional
     parameters : Hyperparameters, optional
         Of the Gaussian process, where they are known; else fitted as ``settings.map.fit`` says.
+    expected_pairs : int, optional
+        That the mission will compare, where it is known: `max_false_loops` is shared out among them.
+        Else each query is given less of it than the one before, so that it holds for any number.
     workers : int
         Threads; the result does not depend on it.
 
@@ -56,10 +49,12 @@ class LoopDetector:
         settings: Settings | None = None,
         *,
         parameters: Hyperparameters | None = None,
+        expected_pairs: int | None = None,
         workers: int = 1,
     ) -> None:
         self.settings = settings or Settings()
         self.parameters = parameters
+        self.expected_pairs = expected_pairs
         self.workers = workers
         self.submaps: dict[str, MappedSubmap] = {}
         self.candidates: list[LoopCandidate] = []
@@ -94,11 +89,21 @@ class LoopDetector:
         """As `add`, for a submap that is mapped already (see `map_submap`)."""
         self._check_name(query.name)
         stored = list(self.submaps.values())[: max(0, len(self.submaps) - self.settings.skip_recent)]
+        pairs = self.expected_pairs or self._open_ended(len(stored))
+        work = partial(compare, query, settings=self.settings, pairs=pairs)
         with ThreadPoolExecutor(self.workers) as pool:
-            candidates = list(pool.map(partial(self._compare, query), stored))
+            candidates = list(pool.map(work, stored))
         self.submaps[query.name] = query
         self.candidates += candidates
         return [candidate for candidate in candidates if candidate]
+
+    def _open_ended(self, count: int) -> float:
+        """Pairs that share out `max_false_loops` when a mission may go on for ever.
+
+        The k-th query may spend 1 / (k (k + 1)) of it, all queries together 1.
+        """
+        k = len({candidate.source for candidate in self.candidates}) + 1
+        return count * k * (k + 1)
 
     def _check_name(self, name: str) -> None:
         if name in self.submaps:
@@ -107,16 +112,6 @@ class LoopDetector:
                 found=f"a second {name!r}",
                 mend="name each submap differently",
             )
-
-    def _compare(self, query: MappedSubmap, stored: MappedSubmap) -> LoopCandidate:
-        return register(
-            query.gradient_map,
-            stored.gradient_map,
-            self.settings,
-            source_features=query.features,
-            target_features=stored.features,
-            names=(query.name, stored.name),
-        )
 
 
 def fit_database(submaps: Sequence[Submap], settings: Settings, *, workers: int = 1) -> Hyperparameters:
@@ -163,4 +158,4 @@ def map_submap(
         seed=settings.seed,
         workers=workers,
     )
-    return MappedSubmap(submap.name, gradient_map, features_of(gradient_map, settings))
+    return MappedSubmap.of(submap.name, gradient_map, settings)

@@ -12,11 +12,12 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from terrainloop.config import Settings
-from terrainloop.detection.detector import LoopDetector, MappedSubmap, fit_database, map_submap
+from terrainloop.detection.detector import LoopDetector, fit_database, map_submap
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.io.missions import Mission
 from terrainloop.io.results import SubmapRecord, submap_record
+from terrainloop.matching.mapped import MappedSubmap
 from terrainloop.submap import Submap
 
 FITTED_SUBMAPS = 3  # the database's hyperparameters are fitted on, spread over the mission
@@ -61,7 +62,6 @@ def detect_mission(
         If no cloud can be used.
     """
     parameters = _fit_mission(mission, settings, workers) if settings.map.fit == "database" else None
-    detector = LoopDetector(settings, parameters=parameters, workers=workers)
     clouds: list[MappedCloud] = []
     for cloud in _map_clouds(mission, settings, parameters, workers):
         clouds.append(cloud)
@@ -73,6 +73,9 @@ def detect_mission(
             found=f"{len(clouds)} broken, the first: {clouds[0].record.notes}",
             mend="mend the clouds or name another folder",
         )
+    compared = max(0, len(usable) - settings.skip_recent)
+    expected_pairs = compared * (compared - 1) // 2 if compared > 1 else None
+    detector = LoopDetector(settings, parameters=parameters, expected_pairs=expected_pairs, workers=workers)
     with threadpool_limits(1, user_api="blas"):
         for done, mapped in enumerate(usable, start=1):
             detector.add_mapped(mapped)

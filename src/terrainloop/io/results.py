@@ -75,7 +75,7 @@ def write_loops(path: str | Path, candidates: Iterable[LoopCandidate]) -> None:
             *(c.source, c.target, *parameters_of(c.T_target_source)),
             *(c.inliers, c.ssd, c.overlap, c.score, c.accepted, c.reason),
             *c.covariance[_UPPER],
-            c.ssd_ratio,
+            *(c.ssd_ratio, c.found_by, c.correlation),
         ]
         for c in candidates
     )
@@ -143,6 +143,8 @@ _LOOP_COLUMNS: dict[str, Kind] = {
     "reason": _TEXT,
     **dict.fromkeys(_COVARIANCE_COLUMNS, _NUMBER),
     "ssd_ratio": _NUMBER,
+    "found_by": _TEXT,
+    "correlation": _NUMBER,
 }
 _SUBMAP_COLUMNS: dict[str, Kind] = {
     "name": _TEXT,

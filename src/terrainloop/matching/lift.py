@@ -5,17 +5,29 @@ sideways; only then is it referred to the frames' origins, which may be far away
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrainloop.geometry import Array, inverse, se3, transform, yaw_of
 from terrainloop.gradient_map import GradientMap
-from terrainloop.matching.ssd import shared_ground, warp
+from terrainloop.matching.covariance import block_covariance
+from terrainloop.matching.ssd import ground_of, shared_ground, warp
 
+# Variance of (x, y, z) per squared metre of way, and of (w_x, w_y, yaw), in that of a submap's strain.
+# Measured on simulated drives: heading drifts, the direction of gravity does not.
+MOTION_BY_STRAIN = (2.0, 2.0, 0.5)
+ROTATION_BY_STRAIN = (0.7, 0.7, 8.0)
+FEWEST = 10  # pixels that tell a tilt
 CLIP = 3.0  # robust standard deviations beyond which an elevation difference is an outlier
 
 
 def lift_to_se3(
-    source: GradientMap, target: GradientMap, T_planar: Array, matched: Array, residuals: Array
+    source: GradientMap,
+    target: GradientMap,
+    T_planar: Array,
+    pivot: Array,
+    covariance_planar: Array,
+    *,
+    strain_variance: float = 0.0,
+    step: int = 1,
 ) -> tuple[Array, Array]:
     """SE(3) transform and covariance from an SE(2) alignment.
 
@@ -27,10 +39,15 @@ def lift_to_se3(
     source, target : GradientMap
     T_planar : array, (3, 3)
         SE(2) T_target_source.
-    matched : array, (n, 2)
-        Inlying keypoints of the source, in the target frame, metres.
-    residuals : array, (n, 2)
-        Their distances to the target's keypoints, metres.
+    pivot : array, (2,)
+        About which the alignment turns, in the target frame, metres; best in the middle of the shared
+        ground.
+    covariance_planar : array, (3, 3)
+        Of (x, y, yaw) at the pivot, metres and radians.
+    strain_variance : float
+        Of each submap, where they are not rigid (see `terrainloop.matching.refine.Refinement`).
+    step : int
+        Look at every step-th row and column of the target only.
 
     Returns
     -------
@@ -38,34 +55,33 @@ def lift_to_se3(
     covariance : array, (6, 6)
         Of (x, y, z, roll, pitch, yaw); NaN where too little ground is shared to tell the tilt.
     """
-    both = shared_ground(source, target, T_planar)
-    if both.sum() * target.resolution**2 <= 4 * _independent_area(target):
+    both = shared_ground(source, target, T_planar, step)
+    ground = ground_of(both, target, step)
+    height = warp(source.elevation, source, target, T_planar, step)[both].astype(float)
+    difference = target.elevation[::step, ::step][both] - height
+    plane = _fit_plane(ground - pivot, difference, target.parameters.length_scale)
+    if plane is None:
         no_tilt = se3(T_planar[0, 2], T_planar[1, 2], 0.0, 0.0, 0.0, yaw_of(T_planar))
         return no_tilt, np.full((6, 6), np.nan)
-    rows, columns = np.nonzero(both)
-    ground = np.stack([columns, rows], axis=1) * target.resolution + target.origin
-    height = warp(source.elevation, source, target, T_planar)[both].astype(float)
-    pivot = ground.mean(axis=0)
-    independent = len(ground) * target.resolution**2 / _independent_area(target)
-    (z, w_x, w_y), covariance_plane = _fit_plane(ground - pivot, target.elevation[both] - height, independent)
-
+    (z, w_x, w_y), covariance_plane = plane
     R = (se3(0, 0, 0, w_x, w_y, 0) @ se3(0, 0, 0, 0, 0, yaw_of(T_planar)))[:3, :3]
     arm = R @ np.array([*transform(inverse(T_planar), pivot), height.mean()])  # source origin to pivot
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = np.array([*pivot, height.mean() + z]) - arm
-    floor = max(source.resolution, target.resolution) / np.sqrt(12)  # a keypoint is no better than that
-    covariance_planar = _planar_covariance(matched - pivot, residuals, floor)
-    return T, _at_source_origin(covariance_planar, covariance_plane, arm, yaw_of(T))
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_([0, 1, 5], [0, 1, 5])] = covariance_planar
+    covariance[np.ix_([2, 3, 4], [2, 3, 4])] = covariance_plane
+    reach = _reach(target, pivot) ** 2 + _reach(source, transform(inverse(T_planar), pivot)) ** 2
+    by_strain = [*(reach * factor for factor in MOTION_BY_STRAIN), *ROTATION_BY_STRAIN]
+    covariance += strain_variance * np.diag(by_strain)
+    return T, _at_source_origin(covariance, arm, yaw_of(T))
 
 
-def _independent_area(gradient_map: GradientMap) -> float:
-    """Ground over which residuals are correlated, m^2: the integral of exp(-d^2 / l^2)."""
-    return float(np.pi * gradient_map.parameters.length_scale**2)
-
-
-def _fit_plane(ground: Array, difference: NDArray[np.floating], independent: float) -> tuple[Array, Array]:
-    """(z, w_x, w_y) by least squares with outliers clipped once; covariance for `independent` samples."""
+def _fit_plane(ground: Array, difference: Array, length_scale: float) -> tuple[Array, Array] | None:
+    """(z, w_x, w_y) by least squares with outliers clipped once, and covariance; None if undetermined."""
+    if len(ground) < FEWEST:
+        return None
     design = np.stack([np.ones(len(ground)), ground[:, 1], -ground[:, 0]], axis=1)
     keep = np.ones(len(difference), dtype=bool)
     for _ in range(2):
@@ -73,29 +89,54 @@ def _fit_plane(ground: Array, difference: NDArray[np.floating], independent: flo
         residual = difference - design @ plane
         spread = 1.4826 * np.median(np.abs(residual - np.median(residual)))
         kept, keep = keep, np.abs(residual) <= max(CLIP * spread, 1e-9)
-    per_sample = (residual[kept] ** 2).sum() / (independent - 3)
-    return plane, per_sample * np.linalg.inv(design[kept].T @ design[kept])
+    covariance = block_covariance(
+        design[kept], residual[kept], design[kept].T @ design[kept], ground[kept], length_scale
+    )
+    return None if np.isnan(covariance).any() else (plane, covariance)
 
 
-def _planar_covariance(matched: Array, residuals: Array, floor: float) -> Array:
-    """Covariance (3, 3) of (x, y, yaw) at the pivot of the SE(2) fit, from its own scatter."""
+def covariance_of_inliers(matched: Array, residuals: Array, floor: float) -> Array:
+    """Covariance of a least-squares SE(2) fit of keypoints, from its own scatter.
+
+    Parameters
+    ----------
+    matched : array, (n, 2)
+        Inlying keypoints of the source, in the target frame relative to the pivot, metres.
+    residuals : array, (n, 2)
+        Their distances to the target's keypoints, metres.
+    floor : float
+        The least standard deviation of a keypoint, metres.
+
+    Returns
+    -------
+    array, (3, 3)
+        Of (x, y, yaw) at the pivot.
+    """
     jacobian = np.zeros((2 * len(matched), 3))
     jacobian[0::2, 0] = jacobian[1::2, 1] = 1.0
     jacobian[0::2, 2], jacobian[1::2, 2] = -matched[:, 1], matched[:, 0]
     scatter = (residuals**2).sum() / max(2 * len(matched) - 3, 1)
     information = jacobian.T @ jacobian + 1e-9 * np.eye(3)  # inliers in one spot leave yaw open
-    return max(scatter, floor**2) * np.linalg.inv(information)
+    return np.asarray(max(scatter, floor**2) * np.linalg.inv(information))
 
 
-def _at_source_origin(covariance_planar: Array, covariance_plane: Array, arm: Array, yaw: float) -> Array:
-    """(x, y, yaw) and (z, w_x, w_y) at the pivot into (x, y, z, roll, pitch, yaw) of the transform.
+def _reach(gradient_map: GradientMap, place: Array) -> float:
+    """From a place to the origin of the map's frame, or to where the map is nearest to it, metres.
+
+    Over this way a submap that is not rigid has carried its errors along.
+    """
+    low = np.array(gradient_map.origin)
+    rows, columns = gradient_map.mask.shape
+    anchor = np.clip(0.0, low, low + gradient_map.resolution * np.array([columns - 1, rows - 1]))
+    return float(np.hypot(*(place - anchor)))
+
+
+def _at_source_origin(covariance: Array, arm: Array, yaw: float) -> Array:
+    """From (x, y, z, w_x, w_y, yaw) at the pivot to (x, y, z, roll, pitch, yaw) of the transform.
 
     The translation is pivot - arm, and a rotation w turns the arm by w x arm; roll and pitch turn
     about the source's axes, w_x and w_y about the target's.
     """
-    covariance = np.zeros((6, 6))
-    covariance[np.ix_([0, 1, 5], [0, 1, 5])] = covariance_planar
-    covariance[np.ix_([2, 3, 4], [2, 3, 4])] = covariance_plane
     jacobian = np.eye(6)
     jacobian[:3, 3:] = [[0, -arm[2], arm[1]], [arm[2], 0, -arm[0]], [-arm[1], arm[0], 0]]
     c, s = np.cos(yaw), np.sin(yaw)

@@ -1,5 +1,6 @@
 """Algorithm 1 of the paper: RANSAC on SE(2) over keypoint associations, verified on the maps."""
 
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -7,12 +8,13 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from terrainloop.config import Settings
 from terrainloop.geometry import Array, fit_se2
 from terrainloop.gradient_map import GradientMap
 from terrainloop.matching.correspondences import Associations
 from terrainloop.matching.ssd import Ssd, compute_ssd
 
-CHUNK = 2_000_000  # distances evaluated at a time, which bounds memory
+CHUNK = 30_000  # distances evaluated at a time, so that they stay in the cache
 MAX_VERIFIED = 200  # inlier sets whose h is computed, which bounds the time of a pair
 
 
@@ -61,16 +63,11 @@ def register_by_ransac(
     Alignment or None
         None if no draw has two inliers; if none is acceptable, the first draw with most inliers.
     """
-    if len(associations) < 2:
-        return None
-    draws = select_random_associations(len(associations), iterations, rng)
-    apart = np.linalg.norm(associations.source[draws[:, 0]] - associations.source[draws[:, 1]], axis=1)
-    draws = draws[apart > inlier_radius]  # closer than their own error, two points tell no rotation
-    T = fit_se2(associations.source[draws], associations.target[draws])
     # Samples half a length scale apart hold what neighbouring pixels repeat: enough to discard by.
     step = max(1, int(target.parameters.length_scale / 2 / target.resolution))
     best = None
-    for inliers in islice(_distinct_by_falling_count(associations, T, inlier_radius), MAX_VERIFIED):
+    proposed = propose(associations, iterations=iterations, inlier_radius=inlier_radius, rng=rng)
+    for inliers in islice(proposed, MAX_VERIFIED):
         T_i = fit_se2(associations.source[inliers], associations.target[inliers])
         hopeful = compute_ssd(source, target, T_i, step).ratio <= max_ssd_ratio
         if hopeful or best is None:
@@ -79,6 +76,35 @@ def register_by_ransac(
                 return alignment
             best = best or alignment
     return best
+
+
+def propose(
+    associations: Associations, *, iterations: int, inlier_radius: float, rng: np.random.Generator
+) -> Iterator[NDArray[np.bool_]]:
+    """Inlier sets of random draws, the largest first, none of them twice, none of one.
+
+    Parameters
+    ----------
+    associations, iterations, inlier_radius, rng
+        As for `register_by_ransac`.
+    """
+    if len(associations) < 2:
+        return
+    draws = select_random_associations(len(associations), iterations, rng)
+    apart = np.linalg.norm(associations.source[draws[:, 0]] - associations.source[draws[:, 1]], axis=1)
+    draws = draws[apart > inlier_radius]  # closer than their own error, two points tell no rotation
+    T = fit_se2(associations.source[draws], associations.target[draws])
+    yield from _distinct_by_falling_count(associations, T, inlier_radius)
+
+
+def inlier_radius_of(settings: Settings, target: GradientMap) -> float:
+    """Largest distance of an inlier, metres: as set, or half the length scale."""
+    return settings.match.inlier_radius or target.parameters.length_scale / 2
+
+
+def draws_of(settings: Settings, *names: str) -> np.random.Generator:
+    """The draws that belong to a pair of submaps, whatever was compared before."""
+    return np.random.default_rng([settings.seed, *(zlib.crc32(name.encode()) for name in names)])
 
 
 def select_random_associations(count: int, iterations: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -90,8 +116,12 @@ def select_random_associations(count: int, iterations: int, rng: np.random.Gener
 
 def get_inliers(associations: Associations, T: Array, inlier_radius: float) -> NDArray[np.bool_]:
     """*GetInliers*: (K, A), which associations each of the transforms (K, 3, 3) brings together."""
-    moved = associations.source @ T[:, :2, :2].transpose(0, 2, 1) + T[:, None, :2, 2]
-    return ((moved - associations.target) ** 2).sum(-1) <= inlier_radius**2
+    # The plane as complex numbers: a rotation is a product.
+    source, target = (points @ (1.0, 1j) for points in (associations.source, associations.target))
+    away = (T[:, :1, 0] + 1j * T[:, 1:2, 0]) * source
+    away += T[:, :1, 2] + 1j * T[:, 1:2, 2]
+    away -= target
+    return away.real**2 + away.imag**2 <= inlier_radius**2
 
 
 def _distinct_by_falling_count(
@@ -103,12 +133,12 @@ def _distinct_by_falling_count(
     counts = np.concatenate(
         [get_inliers(associations, chunk, inlier_radius).sum(1) for chunk in chunks] or [[]]
     )
+    order = np.argsort(-counts, kind="stable")
+    order = order[: np.count_nonzero(counts >= 2)]
     seen = set()
-    for index in np.argsort(-counts, kind="stable"):
-        if counts[index] < 2:
-            return
-        inliers = get_inliers(associations, T[index : index + 1], inlier_radius)[0]
-        key = inliers.tobytes()
-        if key not in seen:
-            seen.add(key)
-            yield inliers
+    for start in range(0, len(order), step):
+        for inliers in get_inliers(associations, T[order[start : start + step]], inlier_radius):
+            key = inliers.tobytes()
+            if key not in seen:
+                seen.add(key)
+                yield inliers

@@ -40,7 +40,7 @@ def compute_ssd(source: GradientMap, target: GradientMap, T_target_source: Array
     T_target_source : array, (3, 3)
         SE(2) transform that takes source coordinates to the target's.
     step : int
-        Look at every step-th row and column of the target only.
+        Look at every step-th row and column of the target only; the sum is scaled to all of them.
     """
     both = shared_ground(source, target, T_target_source, step)
     shared = int(both.sum())
@@ -54,8 +54,8 @@ def compute_ssd(source: GradientMap, target: GradientMap, T_target_source: Array
     g_d = target.magnitude[::step, ::step][both].astype(float)
     v_d = target.variance[::step, ::step][both].astype(float)
     weights = 1.0 / (v_q * v_d)
-    value = float(weights @ (g_q - g_d) ** 2)
-    unrelated = float(weights @ (_centred(g_q, weights) ** 2 + _centred(g_d, weights) ** 2))
+    value = step**2 * float(weights @ (g_q - g_d) ** 2)
+    unrelated = step**2 * float(weights @ (_centred(g_q, weights) ** 2 + _centred(g_d, weights) ** 2))
     return Ssd(value=value, ratio=value / unrelated if unrelated > 0 else np.inf, overlap=float(overlap))
 
 
@@ -66,6 +66,11 @@ def shared_ground(
     known = warp(source.mask.astype(np.float32), source, target, T_target_source, step) > 0.999
     both: NDArray[np.bool_] = known & target.mask[::step, ::step]
     return both
+
+
+def ground_of(pixels: NDArray[np.bool_], target: GradientMap, step: int = 1) -> Array:
+    """Positions (N, 2) in metres of pixels marked on every step-th row and column of the target."""
+    return np.argwhere(pixels)[:, ::-1] * (step * target.resolution) + np.array(target.origin)
 
 
 def warp(

@@ -1,0 +1,244 @@
+"""Exhaustive search of SE(2) for the poses at which two gradient fields agree, by FFT."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from threading import Lock
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from terrainloop.geometry import Array, inverse, se2, transform, yaw_of
+from terrainloop.gradient_map import GradientMap
+from terrainloop.matching.evidence import surprise
+from terrainloop.matching.field import TINY, Field, Image, field_of, turn_field
+
+PIXELS_PER_LENGTH_SCALE = 2  # a finer field tells no more: the spectrum of the process ends there
+MAX_PIXELS = 96  # across; larger maps are searched at twice the spacing, and so on
+TURN = 1.0  # pixels that ground moves between two rotations, root mean square over the map
+GROUP = 3  # rotations that share the sums of energies, which hardly change by a turn
+MIN_AREA = 20.0  # of shared ground, in squared length scales
+EVIDENT = 6.0  # r^2 in units of its mean, above which a pose is looked at: one in seventy
+ROUNDING = 1e-6  # of the FFT, relative to the largest value
+WRAPPED = 0.8  # of the size at which nothing wraps around
+APART = 1.5  # length scales by which two places differ
+
+Spectra = NDArray[np.complex64]
+
+_turning = Lock()  # threads that compare one source wait for its spectra, instead of making them again
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What was found.
+
+    Attributes
+    ----------
+    places : list of arrays, (3, 3)
+        T_target_source, SE(2), of places that differ from one another, best first.
+    null_area : array, (K,)
+        For each of K rotations, evenly spaced from 0 to 2 pi, the ground that counts as one
+        independent sample, m^2; NaN where no shift shares enough ground.
+    tried : float
+        Poses tried: rotations times shifts, these in units of a squared length scale.
+    """
+
+    places: list[Array]
+    null_area: Array
+    tried: float
+
+    def null_area_at(self, yaw: float) -> float:
+        """`null_area` of the rotation nearest to a yaw in radians."""
+        return float(self.null_area[round(yaw / (2 * np.pi) * len(self.null_area)) % len(self.null_area)])
+
+
+class SearchMap:
+    """A gradient map with its fields and their spectra, each computed once.
+
+    Attributes
+    ----------
+    length_scale, spacing : float
+        Of the process, and of the pixels that are searched unless the other map is larger; metres.
+    middle : array, (2,)
+        Of the known ground, metres.
+    radius : float
+        Root mean square distance of the known ground from its middle, metres.
+    """
+
+    def __init__(self, gradient_map: GradientMap) -> None:
+        self._map = gradient_map
+        self._fields: dict[float, Field] = {}
+        self._spectra: dict[tuple[float, int], Spectra] = {}
+        self.length_scale = gradient_map.parameters.length_scale
+        self.spacing = self.length_scale / PIXELS_PER_LENGTH_SCALE
+        while max(gradient_map.mask.shape) * gradient_map.resolution > MAX_PIXELS * self.spacing:
+            self.spacing *= 2
+        ground = _ground(self.field(self.spacing))
+        self.middle = ground.mean(axis=0) if len(ground) else np.array(gradient_map.origin)
+        self.radius = float(np.sqrt(((ground - self.middle) ** 2).sum() / max(len(ground), 1)))
+
+    def field(self, spacing: float) -> Field:
+        """The field at `spacing` metres per pixel."""
+        if spacing not in self._fields:
+            self._fields[spacing] = field_of(self._map, spacing)
+        return self._fields[spacing]
+
+    def spectra(self, spacing: float, size: int) -> Spectra:
+        """Spectra (4, size, size // 2 + 1) of the field: x, y, known ground and energy."""
+        if (spacing, size) not in self._spectra:
+            field = self.field(spacing)
+            energy = field.x**2 + field.y**2
+            self._spectra[spacing, size] = _spectra_of((field.x, field.y, field.known, energy), size)
+        return self._spectra[spacing, size]
+
+
+def search(source: SearchMap, target: SearchMap, count: int) -> Search:
+    """Compare two maps at every rotation and at every shift that shares enough ground.
+
+    With f the field of the target and g that of the source, turned, the correlation at a shift t is
+
+        r(t) = sum_x f(x) . g(x - t) / sqrt(sum_x |f(x)|^2 m_g(x - t)  sum_x m_f(x) |g(x - t)|^2)
+
+    with m the known ground: four correlations of images, each by FFT. If n independent samples of
+    unrelated ground agree by chance, the mean of r^2 is 1 / n; so the mean of r^2 times the shared
+    area, over all shifts of a rotation, is the area of one sample. All but one of the poses are wrong,
+    so this is the null of the very pair, measured: ripples that repeat or slopes that run through
+    make it large.
+
+    Parameters
+    ----------
+    source, target : SearchMap
+    count : int
+        Places wanted.
+    """
+    spacing = max(source.spacing, target.spacing)
+    field = target.field(spacing)
+    size = _size(source.field(spacing), field)
+    with _turning:
+        turned = _turned(source, spacing, size)
+    stored = target.spectra(spacing, size)
+    pixels = (max(source.length_scale, target.length_scale) / spacing) ** 2  # of a squared length scale
+    reach = int(np.ceil(APART * np.sqrt(pixels)))
+    null = np.full(len(turned.poses), np.nan)
+    tried, peaks = 0.0, []
+    for group, ground in enumerate(turned.ground):
+        start = GROUP * group
+        shared, energies = _energies(ground, stored, size)
+        enough = shared > MIN_AREA * pixels
+        admissible = np.count_nonzero(enough)
+        if not admissible:
+            continue
+        scale = np.where(enough, 1.0 / np.sqrt(energies + TINY), 0.0)
+        for k, product in enumerate(_products(turned.fields[start : start + GROUP], stored, size), start):
+            r = product * scale
+            evident = r * r * shared
+            sample = max(float(evident.sum()) / admissible, 1.0)
+            null[k] = sample
+            tried += admissible / pixels
+            rows, columns = np.nonzero((evident > EVIDENT * sample) & (r > 0))
+            surprises = surprise(r[rows, columns] ** 2, shared[rows, columns] / sample)
+            for peak in _two_peaks(surprises, rows, columns, reach):
+                shift = [
+                    index - size * (index >= n)
+                    for index, n in zip((columns[peak], rows[peak]), field.x.shape[::-1], strict=True)
+                ]
+                T = field.metres_from_pixels @ se2(*shift, 0.0) @ turned.poses[k]
+                peaks.append((float(surprises[peak]), T))
+    peaks.sort(key=lambda peak: -peak[0])
+    return Search(_distinct([T for _, T in peaks], source, count), null * spacing**2, tried)
+
+
+def same_place(T: Array, other: Array, source: SearchMap) -> bool:
+    """Whether two poses of a source are nearer to each other than the search tells places apart."""
+    apart = np.hypot(*(transform(T, source.middle) - transform(other, source.middle)))
+    turned = abs(yaw_of(inverse(T) @ other)) * source.radius
+    return bool(max(apart, turned) < APART * source.length_scale)
+
+
+def _distinct(poses: list[Array], source: SearchMap, count: int) -> list[Array]:
+    """The first poses, none of them the same place as one before."""
+    kept: list[Array] = []
+    for T in poses:
+        if len(kept) < count and not any(same_place(T, other, source) for other in kept):
+            kept.append(T)
+    return kept
+
+
+def _two_peaks(values: Array, rows: NDArray[np.int64], columns: NDArray[np.int64], reach: int) -> list[int]:
+    """Index of the largest value, and of the largest that lies further than `reach` pixels from it."""
+    if not len(values):
+        return []
+    first = int(values.argmax())
+    near = np.maximum(np.abs(rows - rows[first]), np.abs(columns - columns[first])) <= reach
+    second = int(np.where(near, -1.0, values).argmax())
+    return [first] if near[second] else [first, second]
+
+
+def _products(fields: Spectra, stored: Spectra, size: int) -> Image:
+    """Sums of scalar products (K, size, size) at every shift of K rotations."""
+    return np.asarray(fft.irfft2(fields[:, 0] * stored[0] + fields[:, 1] * stored[1], s=(size, size)))
+
+
+def _energies(ground: Spectra, stored: Spectra, size: int) -> tuple[Image, Image]:
+    """Shared pixels and the product of the energies over them, at every shift."""
+    sums = ground[[0, 0, 1]] * stored[[2, 3, 2]]
+    shared, energy, other_energy = fft.irfft2(sums, s=(size, size))
+    energies = energy * other_energy
+    return shared, np.maximum(energies, ROUNDING * energies.max())
+
+
+@dataclass(frozen=True, eq=False)
+class _Turned:
+    """A field at K rotations, about the middle of its ground."""
+
+    poses: Array  # (K, 3, 3), from metres of the map to pixels
+    fields: Spectra  # (K, 2, size, size // 2 + 1), conjugate: x and y
+    ground: Spectra  # (K / GROUP, 2, size, size // 2 + 1), conjugate: known and energy, midst each group
+
+
+@lru_cache(maxsize=2)
+def _turned(source: SearchMap, spacing: float, size: int) -> _Turned:
+    field = source.field(spacing)
+    across = _across(field)
+    per_group = TURN * GROUP * spacing
+    groups = int(np.ceil(2 * np.pi * source.radius / per_group))
+    poses = np.empty((groups * GROUP, 3, 3))
+    fields = np.empty((len(poses), 2, size, size // 2 + 1), np.complex64)
+    ground = np.empty((groups, 2, size, size // 2 + 1), np.complex64)
+    pixels_from_metres = np.linalg.inv(field.metres_from_pixels)
+    middle = transform(pixels_from_metres, source.middle)
+    centre = np.array([across / 2, across / 2])
+    for k in range(len(poses)):
+        turn = se2(0.0, 0.0, 2 * np.pi * k / len(poses))
+        turn[:2, 2] = centre - turn[:2, :2] @ middle
+        poses[k] = turn @ pixels_from_metres
+        x, y, known = turn_field(field, inverse(turn), (across + 1, across + 1))
+        fields[k] = np.conj(_spectra_of((x, y), size))
+        if k % GROUP == GROUP // 2:
+            ground[k // GROUP] = np.conj(_spectra_of((known, x**2 + y**2), size))
+    return _Turned(poses, fields, ground)
+
+
+def _spectra_of(images: Sequence[Image], size: int) -> Spectra:
+    return np.asarray(fft.rfft2(np.stack(images), s=(size, size)))
+
+
+def _size(source: Field, target: Field) -> int:
+    """Pixels a side of the FFT.
+
+    Shifts at which maps share only a rim wrap around and add to those at the other side: that costs
+    nothing but the sight of such rims, and saves a third of the time.
+    """
+    return int(fft.next_fast_len(int(WRAPPED * (_across(source) + max(target.known.shape))) + 1, real=True))
+
+
+def _across(field: Field) -> int:
+    """Pixels of a square that holds the known ground at every rotation about its middle."""
+    ground = _ground(field) / field.spacing
+    return int(np.ceil(2 * np.hypot(*(ground - ground.mean(axis=0)).T).max())) + 4 if len(ground) else 0
+
+
+def _ground(field: Field) -> Array:
+    """Middles (N, 2) of the known pixels, metres."""
+    return transform(field.metres_from_pixels, np.argwhere(field.known)[:, ::-1])
