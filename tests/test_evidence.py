@@ -6,11 +6,17 @@ from itertools import combinations
 import numpy as np
 import pytest
 from conftest import STRICT, map_of, with_match
-from scipy.stats import beta
+from scipy.stats import beta, binom
 
 from terrainloop.geometry import inverse, se2, se3, transform, yaw_of
 from terrainloop.matching.covariance import BLOCK, block_covariance
-from terrainloop.matching.evidence import NO_EVIDENCE, log10_false_alarms, surprise
+from terrainloop.matching.evidence import (
+    NO_EVIDENCE,
+    log_poses,
+    surprise,
+    surprise_of_both,
+    surprise_of_inliers,
+)
 from terrainloop.matching.mapped import MappedSubmap
 from terrainloop.matching.refine import USUAL_STRAIN, refine
 from terrainloop.matching.register import compare, register
@@ -59,15 +65,36 @@ def test_surprise_at_the_ends():
     assert surprise(1.0, 100.0) == surprise(0.9999, 100.0)  # no map is trusted to agree that well
 
 
-def test_false_alarms_grow_with_what_was_tried_and_fall_with_the_surprise():
-    at = [log10_false_alarms(s, 1e4) for s in (0.0, 10.0, 20.0, 200.0)]
-    assert 2 < at[0] < 4  # at no surprise nearly all that was tried
-    assert at[1] - at[2] == pytest.approx(at[0] - at[1])
-    assert at[0] - at[1] == pytest.approx(10 / np.log(10), rel=0.3)  # a nat a nat, nearly
-    assert at[3] < -60
-    assert log10_false_alarms(10.0, 1e6) - log10_false_alarms(10.0, 1e4) == pytest.approx(2.0)
-    assert log10_false_alarms(0.0, 0.0) == 0.0
-    assert isinstance(at[0], float)
+def test_surprise_of_inliers_is_the_binomial_tail():
+    for inliers, associations, chance in ((1, 40, 0.01), (3, 130, 0.002), (20, 150, 0.003), (40, 40, 0.5)):
+        exact = -binom.logsf(inliers - 1, associations, chance)
+        assert surprise_of_inliers(inliers, associations, chance) == pytest.approx(exact, rel=1e-6)
+    assert surprise_of_inliers(0, 50, 0.01) == surprise_of_inliers(-2, 50, 0.01) == 0
+    assert surprise_of_inliers(3, 3, 1.0) == pytest.approx(0)
+    assert np.isfinite(surprise_of_inliers(400, 400, 1e-4))
+
+
+def test_two_surprises_are_as_rare_together_as_they_say():
+    """Independent ones of unit decay: chance exceeds a level no more often than exp(-level), nor far less."""
+    rng = np.random.default_rng(0)
+    field, inliers = rng.exponential(size=(2, 200_000))
+    both = np.array([surprise_of_both(f, i) for f, i in zip(field, inliers, strict=True)])
+    for level in (1.0, 3.0, 5.0):
+        assert 0.4 * np.exp(-level) < (both >= level).mean() < 1.05 * np.exp(-level)
+
+
+def test_inliers_can_only_help():
+    """But for the factor of two that it costs to look at them."""
+    assert surprise_of_both(30.0, 0.0) == pytest.approx(30.0 - np.log(2))
+    assert surprise_of_both(30.0, 30.0) > 54.0
+    assert surprise_of_both(0.0, 0.0) == 0.0
+    values = [surprise_of_both(12.0, inliers) for inliers in np.linspace(0, 50, 60)]
+    assert (np.diff(values) >= 0).all()
+
+
+def test_the_number_of_poses_goes_with_what_was_tried():
+    assert log_poses(1e6) - log_poses(1e4) == pytest.approx(np.log(100))
+    assert log_poses(0.0) == 0.0
 
 
 # --- the covariance of a fit

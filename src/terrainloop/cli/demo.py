@@ -20,7 +20,7 @@ def command(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for mission and results.")] = Path(
         "demo"
     ),
-    world: Annotated[str, typer.Option("--world", help="etna, morocco, mars or flat.")] = "etna",
+    world: Annotated[str, typer.Option("--world", help="etna, morocco, mars, flat or ripples.")] = "etna",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed, another place.")] = 0,
     submaps: Annotated[int, typer.Option("--submaps", min=3, help="How many; 16 have loops.")] = 16,
     workers: WorkersOption = 0,

@@ -10,7 +10,7 @@ from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose
 
 def command(
     output: Annotated[Path, typer.Option("-o", "--output", help="Mission folder to write.")],
-    world: Annotated[str, typer.Option("--world", help="etna, morocco, mars or flat.")] = "etna",
+    world: Annotated[str, typer.Option("--world", help="etna, morocco, mars, flat or ripples.")] = "etna",
     seed: Annotated[int, typer.Option("--seed", help="Another seed, another place and drive.")] = 0,
     submaps: Annotated[int, typer.Option("--submaps", help="How many; 16 have loops.")] = 16,
     sensor: Annotated[str, typer.Option("--sensor", help="stereo or lidar.")] = "stereo",

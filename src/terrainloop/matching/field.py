@@ -5,6 +5,7 @@ same ground, turning and shifting one makes the vectors agree, everywhere at onc
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -92,16 +93,16 @@ def field_of(gradient_map: GradientMap, spacing: float) -> Field:
     rows, columns = (int(np.ceil((n - 1) / step)) + 1 for n in mask.shape)
     every_step = np.array([[step, 0.0, 0.0], [0.0, step, 0.0]])
 
-    def average(image: NDArray[np.floating]) -> Image:
-        smooth = cv2.GaussianBlur(
-            image.astype(np.float32), (0, 0), max(0.4 * step, 0.3), borderType=cv2.BORDER_CONSTANT
-        )
-        return _warp(smooth, every_step, (columns, rows), cv2.INTER_LINEAR)
+    def average(image: NDArray[Any]) -> Image:
+        sigma = max(0.4 * step, 0.3)
+        smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
+        return _warp(np.asarray(smooth, dtype=np.float32), every_step, (columns, rows), cv2.INTER_LINEAR)
 
     ground = average(mask)
     known = (ground > 0.5).astype(np.float32)
-    x, y = (average(image * weight) * known / np.maximum(ground, 0.5) for image in (x, y))
-    return Field(*_clipped(*_whitened(x, y, known), known), known, gradient_map.origin, spacing)
+    share = np.asarray(known / np.maximum(ground, 0.5), dtype=np.float32)
+    white = _whitened(average(x * weight) * share, average(y * weight) * share, known)
+    return Field(*_clipped(*white, known), known, gradient_map.origin, spacing)
 
 
 def turn_field(field: Field, affine: Array, size: tuple[int, int]) -> tuple[Image, Image, Image]:

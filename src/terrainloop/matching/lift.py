@@ -92,7 +92,7 @@ def _fit_plane(ground: Array, difference: Array, length_scale: float) -> tuple[A
     covariance = block_covariance(
         design[kept], residual[kept], design[kept].T @ design[kept], ground[kept], length_scale
     )
-    return None if np.isnan(covariance).any() else (plane, covariance)
+    return None if np.isnan(covariance).any() else (np.asarray(plane, dtype=float), covariance)
 
 
 def covariance_of_inliers(matched: Array, residuals: Array, floor: float) -> Array:

@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from terrainloop.geometry import Array, se2
 from terrainloop.gradient_map import GradientMap
@@ -99,7 +101,8 @@ class Refinement:
         flat = jacobian.reshape(-1, jacobian.shape[-1])
         weighted = flat * self.weights.reshape(-1, 1)
         normal = weighted.T @ flat
-        return -np.linalg.lstsq(normal, weighted.T @ self.residual.ravel(), rcond=None)[0], normal
+        fitted = np.linalg.lstsq(normal, weighted.T @ self.residual.ravel(), rcond=None)[0]
+        return np.asarray(-fitted, dtype=float), normal
 
     def _fit(self, jacobian: Array) -> tuple[Array, Array]:
         """Least-squares parameters (P,) and their covariance (P, P)."""
@@ -163,7 +166,7 @@ def _linearise(source: GradientMap, target: GradientMap, T: Array, places: int) 
     chosen = known[:: -(-len(known) // places)]
     ground = ground_of(shared, target, step)[:: -(-len(known) // places)]
 
-    def at_places(images: Array) -> Array:
+    def at_places(images: NDArray[Any]) -> Array:
         return images.reshape(len(images), -1)[:, chosen].astype(float)
 
     warped = [warp(image, source, target, T, step) for image in (source.gradient_x, source.gradient_y)]

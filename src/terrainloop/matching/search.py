@@ -139,11 +139,9 @@ def search(source: SearchMap, target: SearchMap, count: int) -> Search:
             rows, columns = np.nonzero((evident > EVIDENT * sample) & (r > 0))
             surprises = surprise(r[rows, columns] ** 2, shared[rows, columns] / sample)
             for peak in _two_peaks(surprises, rows, columns, reach):
-                shift = [
-                    index - size * (index >= n)
-                    for index, n in zip((columns[peak], rows[peak]), field.x.shape[::-1], strict=True)
-                ]
-                T = field.metres_from_pixels @ se2(*shift, 0.0) @ turned.poses[k]
+                row, column = int(rows[peak]), int(columns[peak])
+                dx, dy = column - size * (column >= field.x.shape[1]), row - size * (row >= field.x.shape[0])
+                T = field.metres_from_pixels @ se2(dx, dy, 0.0) @ turned.poses[k]
                 peaks.append((float(surprises[peak]), T))
     peaks.sort(key=lambda peak: -peak[0])
     return Search(_distinct([T for _, T in peaks], source, count), null * spacing**2, tried)
@@ -165,7 +163,9 @@ def _distinct(poses: list[Array], source: SearchMap, count: int) -> list[Array]:
     return kept
 
 
-def _two_peaks(values: Array, rows: NDArray[np.int64], columns: NDArray[np.int64], reach: int) -> list[int]:
+def _two_peaks(
+    values: NDArray[np.floating], rows: NDArray[np.int64], columns: NDArray[np.int64], reach: int
+) -> list[int]:
     """Index of the largest value, and of the largest that lies further than `reach` pixels from it."""
     if not len(values):
         return []
@@ -206,7 +206,7 @@ def _turned(source: SearchMap, spacing: float, size: int) -> _Turned:
     poses = np.empty((groups * GROUP, 3, 3))
     fields = np.empty((len(poses), 2, size, size // 2 + 1), np.complex64)
     ground = np.empty((groups, 2, size, size // 2 + 1), np.complex64)
-    pixels_from_metres = np.linalg.inv(field.metres_from_pixels)
+    pixels_from_metres = np.asarray(np.linalg.inv(field.metres_from_pixels), dtype=float)
     middle = transform(pixels_from_metres, source.middle)
     centre = np.array([across / 2, across / 2])
     for k in range(len(poses)):
@@ -241,4 +241,4 @@ def _across(field: Field) -> int:
 
 def _ground(field: Field) -> Array:
     """Middles (N, 2) of the known pixels, metres."""
-    return transform(field.metres_from_pixels, np.argwhere(field.known)[:, ::-1])
+    return transform(field.metres_from_pixels, np.argwhere(field.known)[:, ::-1].astype(float))

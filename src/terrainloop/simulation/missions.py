@@ -140,7 +140,7 @@ def simulate_mission(
     Parameters
     ----------
     world : str
-        "etna", "morocco", "mars" or "flat".
+        "etna", "morocco", "mars", "flat" or "ripples".
     seed : int
         Not negative.
     submaps : int

@@ -101,11 +101,18 @@ def _flat(rng: Generator, grid: Grid) -> Array:
     return power_law(rng, grid, rms=0.002, outer_scale=0.5, exponent=2.6)
 
 
+def _ripples(rng: Generator, grid: Grid) -> Array:
+    """Nothing but wind ripples: ground that repeats itself."""
+    sand = power_law(rng, grid, rms=0.004, outer_scale=0.3, exponent=3.0)
+    return sand + ripples(rng, grid, height=0.10, wavelength=1.5)
+
+
 _WORLDS: dict[str, Callable[[Generator, Grid], Array]] = {
     "etna": _etna,
     "morocco": _morocco,
     "mars": _mars,
     "flat": _flat,
+    "ripples": _ripples,
 }
 WORLDS = tuple(_WORLDS)
 

@@ -1,0 +1,331 @@
+"""Matching measured: recall by what proposes and decides, false alarms, covariance, time.
+
+    python benchmarks/matching.py recall MISSION...   keypoints, dense, both: by shared ground and direction
+    python benchmarks/matching.py null MISSION...     submaps of different missions, which share nothing
+    python benchmarks/matching.py errors MISSION...   errors of accepted loops against their covariance
+    python benchmarks/matching.py time MISSION        one query against 14 submaps, by stage
+    python benchmarks/matching.py sensors             stereo submaps against LiDAR submaps of one world
+
+A mission is a folder with clouds and truth.tum ('terrainloop simulate' makes some); passes.csv beside them
+names sessions, of which only different ones are compared. Maps are kept in ~/.cache/terrainloop-benchmarks.
+"""
+
+import argparse
+import hashlib
+import pickle
+import platform
+import time
+from collections import defaultdict
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from functools import lru_cache, partial
+from itertools import combinations
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.random import SeedSequence
+from scipy.stats import chi2
+from threadpoolctl import threadpool_limits
+
+from terrainloop import Settings, Submap, __version__
+from terrainloop.detection.detector import fit_database, map_submap
+from terrainloop.detection.mission import _fit_mission
+from terrainloop.evaluation.judge import judge
+from terrainloop.geometry import inverse, parameters_of, yaw_of
+from terrainloop.io.missions import load_mission
+from terrainloop.io.results import submap_record
+from terrainloop.io.trajectories import read_trajectory
+from terrainloop.matching import by_evidence
+from terrainloop.matching.register import compare
+from terrainloop.simulation.missions import SETUPS, _submap
+from terrainloop.simulation.odometry import estimate, true_poses
+from terrainloop.simulation.paths import revisiting_path
+from terrainloop.simulation.terrain import make_terrain
+
+CACHE = Path.home() / ".cache" / "terrainloop-benchmarks"
+BANDS = ((0.3, 1.0), (0.1, 0.3))
+EVIDENCE = Settings()
+INLIERS = Settings.model_validate({"match": {"decision": "inliers"}})
+# What proposes, and what decides: the dense places, the inlier sets looked at, the settings.
+METHODS = {
+    "keypoints, inlier count": (0, 0, INLIERS),
+    "keypoints, evidence": (0, 20, EVIDENCE),
+    "dense, evidence": (2, 0, EVIDENCE),
+    "both, evidence (default)": (2, 6, EVIDENCE),
+}
+
+
+@lru_cache(maxsize=4)
+def mapped(folder):
+    """Mapped submaps, their records and true poses, and sessions of a mission."""
+    mission = load_mission(folder)
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    key = hashlib.sha256(
+        repr([(str(f), f.stat().st_mtime_ns, __version__) for f in files]).encode()
+    ).hexdigest()
+    cache = CACHE / f"{key[:16]}.pickle"
+    if not cache.exists():
+        parameters = _fit_mission(mission, EVIDENCE, 2)
+        submaps = [mission.read(index) for index in range(len(mission))]
+        content = (
+            [map_submap(s, EVIDENCE, parameters, workers=2) for s in submaps],
+            list(map(submap_record, submaps)),
+        )
+        CACHE.mkdir(parents=True, exist_ok=True)
+        cache.write_bytes(pickle.dumps(content))
+    submaps, records = pickle.loads(cache.read_bytes())
+    sessions = None
+    if (folder / "passes.csv").exists():
+        sessions = dict(line.split(",") for line in (folder / "passes.csv").read_text().split()[1:])
+    return submaps, records, read_trajectory(folder / "truth.tum").poses, sessions
+
+
+def compare_all(job):
+    """One submap of one mission against several of another."""
+    dense, looked_at, settings, source, index, target, others, pairs = job
+    cv2.setNumThreads(1)
+    by_evidence.DENSE, by_evidence.LOOKED_AT = dense, looked_at
+    query, stored = mapped(source)[0][index], mapped(target)[0]
+    with threadpool_limits(1):
+        return [compare(query, stored[other], settings, pairs=pairs) for other in others]
+
+
+def judged(pool, folder, method):
+    """Every pair of a mission that odometry does not join, and the truth about it."""
+    submaps, records, poses, sessions = mapped(folder)
+    jobs = []
+    for i, submap in enumerate(submaps):
+        others = [
+            j for j in range(i - 1) if sessions is None or sessions[submap.name] != sessions[submaps[j].name]
+        ]
+        jobs.append((*METHODS[method], folder, i, folder, others, len(submaps) * (len(submaps) - 1) / 2))
+    candidates = [c for found in pool.map(compare_all, jobs) for c in found]
+    turned = {
+        (records[i].name, records[j].name): abs(yaw_of(inverse(poses[j]) @ poses[i]))
+        for i in range(len(poses))
+        for j in range(i)
+    }
+    return judge(candidates, records, poses, sessions), turned
+
+
+def recall(folders):
+    print("| mission | method | " + " | ".join(f"IoU {a}-{b}: best, accepted" for a, b in BANDS), end="")
+    print(" | same way | opposite | across | loops | wrong | disjoint | found by dense / sparse |")
+    print("|---" * 11 + "|")
+    total = defaultdict(list)
+    with ProcessPoolExecutor(2) as pool:
+        for folder in folders:
+            for method in METHODS:
+                pairs, turned = judged(pool, folder, method)
+                row = recall_row(pairs, turned)
+                total[method].append(row)
+                print(f"| {folder.name} | {method} | {cells(row)} |", flush=True)
+    for method, rows in total.items():
+        mean = [np.nanmean(values) for values in zip(*(row[:7] for row in rows), strict=True)]
+        print(f"| mean, sums | {method} | {cells([*mean, *np.sum([row[7:] for row in rows], axis=0)])} |")
+
+
+def recall_row(pairs, turned):
+    score = np.array([p.candidate.score for p in pairs])
+    overlap = np.array([p.overlap for p in pairs])
+    right = np.array([p.pose_is_right for p in pairs])
+    accepted = np.array([bool(p.candidate) for p in pairs])
+    turn = np.array([turned[p.candidate.source, p.candidate.target] for p in pairs])
+    dense = np.array([p.candidate.found_by == "dense" for p in pairs])
+    first_false = score[(overlap <= 0) | ~right & accepted & (overlap <= 0)].max(initial=-np.inf)
+    row = []
+    for low, high in BANDS:
+        band = (overlap > low) & (overlap <= high)
+        row += [share(right & (score > first_false), band), share(right & accepted, band)]
+    for low, high in ((0, 45), (135, 180), (45, 135)):
+        way = (overlap > 0.1) & (np.degrees(turn) >= low) & (np.degrees(turn) <= high)
+        row.append(share(right & accepted, way))
+    good = right & accepted
+    return [
+        *row,
+        accepted.sum(),
+        (accepted & ~right).sum(),
+        (accepted & (overlap <= 0)).sum(),
+        (good & dense).sum(),
+        (good & ~dense).sum(),
+    ]
+
+
+def share(what, of):
+    return what[of].mean() if of.any() else np.nan
+
+
+def cells(row):
+    best = f"{row[0]:.2f}, {row[1]:.2f} | {row[2]:.2f}, {row[3]:.2f}"
+    ways = " | ".join(f"{value:.2f}" for value in row[4:7])
+    return (
+        f"{best} | {ways} | "
+        + " | ".join(f"{int(n)}" for n in row[7:10])
+        + f" | {int(row[10])} / {int(row[11])}"
+    )
+
+
+def null(folders):
+    """Expected and observed false alarms over pairs of submaps of different missions."""
+    loosened = Settings.model_validate({"match": {"max_false_loops": 1e6}})  # so that every pair is refined
+    scores, accepted = defaultdict(list), 0
+    with ProcessPoolExecutor(2) as pool:
+        for a, b in combinations(folders, 2):
+            others = list(range(len(mapped(b)[0])))
+            jobs = [(2, 6, loosened, a, i, b, others, 1.0) for i in range(len(mapped(a)[0]))]
+            for found in pool.map(compare_all, jobs):
+                scores[" ".join(sorted({a.name.split("_")[0], b.name.split("_")[0]}))] += [
+                    c.score for c in found
+                ]
+    count = sum(map(len, scores.values()))
+    accepted = sum(
+        (np.array(s) >= np.log10(count / EVIDENCE.match.max_false_loops)).sum() for s in scores.values()
+    )
+    print(
+        f"{count} pairs that share nothing; accepted as one mission with max_false_loops 0.01: {accepted}\n"
+    )
+    levels = (1, 0.1, 0.03, 0.01, 0.003, 0.001)
+    print("| worlds | pairs | " + " | ".join(f"{x:g} a pair" for x in levels) + " | largest score |")
+    print("|---" * (len(levels) + 3) + "|")
+    for name, values in {"all": np.concatenate(list(scores.values())), **scores}.items():
+        values = np.asarray(values)
+        ratios = [f"{(values >= -np.log10(x)).sum()} / {-np.expm1(-x) * len(values):.1f}" for x in levels]
+        print(f"| {name} | {len(values)} | {' | '.join(ratios)} | {values.max():.1f} |")
+
+
+def errors(folders):
+    """Errors of accepted loops of the right place, and their squares normalised by the covariance."""
+    print("| mission | loops | x-y, m | z, m | yaw, deg ", end="")
+    print("| NEES / 6 | x, y, yaw / 3 | z, roll, pitch / 3 | within 95 % |")
+    print("|---" * 9 + "|")
+    with ProcessPoolExecutor(2) as pool:
+        for folder in folders:
+            pairs, _ = judged(pool, folder, "both, evidence (default)")
+            _, records, poses, _ = mapped(folder)
+            order = {record.name: index for index, record in enumerate(records)}
+            squares, plane, rest = [], [], []
+            good = [p for p in pairs if p.candidate and p.pose_is_right]
+            for p in good:
+                c = p.candidate
+                truth = inverse(poses[order[c.target]]) @ poses[order[c.source]]
+                error = parameters_of(c.T_target_source) - parameters_of(truth)
+                error[3:] = (error[3:] + np.pi) % (2 * np.pi) - np.pi
+                squares.append(error @ np.linalg.solve(c.covariance, error))
+                for part, values in (([0, 1, 5], plane), ([2, 3, 4], rest)):
+                    block = c.covariance[np.ix_(part, part)]
+                    values.append(error[part] @ np.linalg.solve(block, error[part]))
+            median = [
+                np.median([getattr(p, name) for p in good])
+                for name in ("position_error", "height_error", "yaw_error")
+            ]
+            within = np.mean(np.array(squares) < chi2.ppf(0.95, 6))
+            nees = f"{np.mean(squares) / 6:.2f} | {np.mean(plane) / 3:.2f} | {np.mean(rest) / 3:.2f}"
+            print(
+                f"| {folder.name} | {len(good)} | {median[0]:.3f} | {median[1]:.3f} "
+                f"| {np.degrees(median[2]):.2f} | {nees} | {within:.0%} |",
+                flush=True,
+            )
+
+
+def query_time(folders):
+    """The last submap against 14 others; stages are timed on one thread."""
+    cv2.setNumThreads(1)
+    submaps = mapped(folders[0])[0]
+    query, stored = submaps[-1], submaps[:14]
+    spent = defaultdict(float)
+
+    def timed(name):
+        original = getattr(by_evidence, name)
+
+        def wrapper(*args, **kwargs):
+            start = time.perf_counter()
+            try:
+                return original(*args, **kwargs)
+            finally:
+                spent[name] += time.perf_counter() - start
+
+        return original, wrapper
+
+    work = partial(compare, query, settings=EVIDENCE, pairs=105)
+    print(f"{platform.machine()}, {folders[0].name}, submap {query.name} against {len(stored)}")
+    with threadpool_limits(1):
+        for threads in (1, 2):
+            times = []
+            for _ in range(7):
+                start = time.perf_counter()
+                with ThreadPoolExecutor(threads) as pool:
+                    list(pool.map(work, stored))
+                times.append(time.perf_counter() - start)
+            print(f"{threads} thread(s): median {1e3 * np.median(times):.0f} ms")
+        stages = ("search", "associate", "_hypotheses", "refine_roughly", "refine", "_candidate")
+        originals = {name: timed(name) for name in stages}
+        for name, (_, wrapper) in originals.items():
+            setattr(by_evidence, name, wrapper)
+        list(map(work, stored))
+        for name, (original, _) in originals.items():
+            setattr(by_evidence, name, original)
+    for name in stages:
+        print(f"  {name}: {1e3 * spent[name] / len(stored):.2f} ms a pair")
+
+
+def sensors(_):
+    """Stereo submaps against LiDAR submaps of one simulated world, driven along one path."""
+    seed, drive = SeedSequence(7), 112.0
+    print("| world | pairs | IoU > 0.1 | found | wrong | share nothing | accepted of these | error |")
+    print("|---" * 8 + "|")
+    for world in ("etna", "mars", "morocco"):
+        for_terrain, for_path, *streams = seed.spawn(6)
+        lidar = SETUPS["lidar"]
+        path = revisiting_path(np.random.default_rng(for_path), drive, lidar.frame_spacing)
+        half = np.abs(path.xy).max() + lidar.sensor.max_range + 2.0
+        terrain = make_terrain(world, for_terrain, 2 * float(half), SETUPS["stereo"].terrain_resolution)
+        clouds, poses, kinds = [], [], []
+        for kind, (for_odometry, for_sensor) in zip(
+            ("lidar", "stereo"), (streams[:2], streams[2:]), strict=True
+        ):
+            setup = SETUPS[kind]
+            path = revisiting_path(np.random.default_rng(for_path), drive, setup.frame_spacing)
+            true = true_poses(terrain, path)
+            frames = estimate(true, setup.frames, setup.drift, np.random.default_rng(for_odometry))
+            count = len(true) // setup.frames
+            with ThreadPoolExecutor() as pool:
+                for i, stream in enumerate(for_sensor.spawn(count)):
+                    chosen = slice(i * setup.frames, (i + 1) * setup.frames)
+                    clouds.append(_submap(setup, terrain, true[chosen], frames.local[chosen], stream, pool))
+                    kinds.append(kind)
+            poses += list(frames.truth[:count])
+        submaps = [Submap(points, f"{i:03d}", float(i)) for i, points in enumerate(clouds)]
+        stereo = [s for s, kind in zip(submaps, kinds, strict=True) if kind == "stereo"]
+        parameters = fit_database(stereo[:3], EVIDENCE, workers=2)
+        ready = [map_submap(s, EVIDENCE, parameters, workers=2) for s in submaps]
+        first = kinds.index("stereo")
+        candidates = [
+            compare(b, a, EVIDENCE, pairs=len(stereo) * first) for b in ready[first:] for a in ready[:first]
+        ]
+        records = [submap_record(s) for s in submaps]
+        pairs = judge(candidates, records, np.array(poses))
+        true_pairs = [p for p in pairs if p.overlap > 0.1]
+        found = [p for p in true_pairs if p.candidate and p.pose_is_right]
+        apart = [p for p in pairs if p.overlap <= 0]
+        wrong = sum(bool(p.candidate) and not p.pose_is_right for p in pairs)
+        error = np.median([p.position_error for p in found])
+        print(
+            f"| {world} | {len(pairs)} | {len(true_pairs)} | {len(found)} | {wrong} | {len(apart)} "
+            f"| {sum(bool(p.candidate) for p in apart)} | {error:.3f} m |",
+            flush=True,
+        )
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=("recall", "null", "errors", "time", "sensors"))
+    parser.add_argument("folders", nargs="*", type=Path)
+    args = parser.parse_args()
+    run = {"recall": recall, "null": null, "errors": errors, "time": query_time, "sensors": sensors}
+    run[args.what](args.folders)
+
+
+if __name__ == "__main__":
+    main()
