@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 WORLDS = ("etna", "mars", "morocco")
-SHOWN_THRESHOLDS = (3, 4, 5, 6, 8)
+SHOWN_THRESHOLDS = {"min_inliers": (3, 4, 5, 6, 8), "min_score": (1, 2, 4, 6, 10)}
 SHOWN_NUMBERS = ("precision", "pose_precision", "recall")
 
 
@@ -42,7 +42,9 @@ def _number(value):
 
 
 def markdown(results):
-    heads = [f"n >= {n}" for n in SHOWN_THRESHOLDS]
+    key = next(iter(next(iter(results.values()))["precision_recall"][0]))
+    shown = SHOWN_THRESHOLDS[key]
+    heads = [f"{key.removeprefix('min_')} >= {n}" for n in shown]
     yield (
         "| mission | pairs (true) | "
         + " | ".join(heads)
@@ -50,8 +52,8 @@ def markdown(results):
     )
     yield "|---" * (len(heads) + 6) + "|"
     for name, result in results.items():
-        points = {point["min_inliers"]: point for point in result["precision_recall"]}
-        cells = [" / ".join(_number(points[n][key]) for key in SHOWN_NUMBERS) for n in SHOWN_THRESHOLDS]
+        points = {point[key]: point for point in result["precision_recall"]}
+        cells = [" / ".join(_number(points[n][number]) for number in SHOWN_NUMBERS) for n in shown]
         best = result["recall_before_first_disjoint"]
         yield (
             f"| {name} | {result['pairs']} ({result['true_pairs']}) | {' | '.join(cells)} "

@@ -369,6 +369,14 @@ def test_detect_is_silent_when_asked(cli, mission_folder, config, tmp_path):
     assert Settings.from_yaml(tmp_path / "out" / "config.yaml").seed == 3
 
 
+def test_a_run_by_inliers_is_scored_over_inliers(ok, run, mission_folder, tmp_path):
+    for name in ("pairs.csv", "submaps.csv"):
+        (tmp_path / name).write_bytes((run / name).read_bytes())
+    (tmp_path / "config.yaml").write_text("match: {decision: inliers}")
+    told = json.loads(ok("evaluate", tmp_path, "--truth", mission_folder / "truth.tum", "--json"))
+    assert [point["min_inliers"] for point in told["precision_recall"]] == list(range(1, 21))
+
+
 def test_evaluate_scores_the_run(ok, run, mission_folder):
     told = json.loads(ok("evaluate", run, "--truth", mission_folder / "truth.tum", "--json"))
     # Of the 6 pairs one is consecutive (000000 and 000001) and so is 000003 with 000004.
@@ -378,8 +386,7 @@ def test_evaluate_scores_the_run(ok, run, mission_folder):
     assert 0 <= told["median_position_error_m"] < 0.15
     assert told["median_yaw_error_deg"] < 3
     curve = told["precision_recall"]
-    assert [point["min_inliers"] for point in curve] == list(range(1, 21))
-    at_ten = curve[9]
+    at_ten = next(point for point in curve if point["min_score"] == 10)
     assert (at_ten["precision"], at_ten["recall"]) == (1.0, 1.0)
     recalls = [point["recall"] for point in curve]
     assert recalls == sorted(recalls, reverse=True)

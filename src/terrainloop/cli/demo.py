@@ -68,7 +68,7 @@ def command(
 def _draw(
     output: Path, mission: "Mission", detector: "LoopDetector", records: Sequence["SubmapRecord"]
 ) -> list[Path]:
-    """The mission with its loops, one gradient map, and the match with the most inliers."""
+    """The mission with its loops, one gradient map, and the surest match."""
     from terrainloop.report.figures import figure_map, figure_mission, save_figure
 
     assert mission.truth is not None

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from terrainloop.evaluation.judge import JudgedPair
     from terrainloop.evaluation.precision_recall import OperatingPoint
 
-INLIER_THRESHOLDS = range(1, 21)  # the paper's
+INLIER_THRESHOLDS: Sequence[int] = tuple(range(1, 21))  # the paper's
+SCORE_THRESHOLDS: Sequence[int] = (0, 1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 50)
 
 
 def command(
@@ -39,7 +40,7 @@ def command(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Hold a run's pairs against true poses: precision and recall over the inlier threshold.
+    """Hold a run's pairs against true poses: precision and recall over the score or the inlier threshold.
 
     Consecutive submaps are left out: odometry joins them anyway. Detect with --all-pairs to score
     every other pair.
@@ -58,15 +59,18 @@ def command(
         read_trajectory(truth).poses,
         _read_sessions(sessions) if sessions else None,
     )
-    acceptable = Settings.from_yaml(run / "config.yaml").match.max_ssd_ratio
-    # Algorithm 1 returns the inliers of an acceptable transform only.
-    inliers = [pair.candidate.inliers if pair.candidate.ssd_ratio <= acceptable else 0 for pair in pairs]
-    points = precision_recall(inliers, [pair.overlap > min_overlap for pair in pairs], INLIER_THRESHOLDS)
-    by_pose = precision_recall(inliers, [pair.pose_is_right for pair in pairs], INLIER_THRESHOLDS)
-    rows = [_row(point, posed.precision) for point, posed in zip(points, by_pose, strict=True)]
-    save_figure(
-        figure_precision_recall(points, f"true match: IoU > {min_overlap:g}"), run / "precision_recall.png"
-    )
+    match = Settings.from_yaml(run / "config.yaml").match
+    if match.decision == "evidence":
+        name, thresholds, values = "score", SCORE_THRESHOLDS, [pair.candidate.score for pair in pairs]
+    else:  # Algorithm 1 returns the inliers of an acceptable transform only
+        name, thresholds = "inliers", INLIER_THRESHOLDS
+        fit = [pair.candidate.ssd_ratio <= match.max_ssd_ratio for pair in pairs]
+        values = [pair.candidate.inliers * fits for pair, fits in zip(pairs, fit, strict=True)]
+    points = precision_recall(values, [pair.overlap > min_overlap for pair in pairs], thresholds)
+    by_pose = precision_recall(values, [pair.pose_is_right for pair in pairs], thresholds)
+    rows = [_row(name, point, posed.precision) for point, posed in zip(points, by_pose, strict=True)]
+    figure = figure_precision_recall(points, f"true match: IoU > {min_overlap:g}", f"least {name}")
+    save_figure(figure, run / "precision_recall.png")
     _write_rows(run / "precision_recall.csv", rows)
     summary = summarise(pairs, min_overlap) | {"precision_recall": rows}
     terminal.result(summary, lambda console: show(console, summary))
@@ -107,7 +111,7 @@ def show(console: Console, summary: dict[str, Any]) -> None:
     """The summary and the curve, as text."""
     rows = [
         [
-            str(row["min_inliers"]),
+            f"{next(iter(row.values())):g}",
             f"{row['precision']:.3f}",
             f"{row['recall']:.3f}",
             str(row["true_positives"]),
@@ -118,7 +122,8 @@ def show(console: Console, summary: dict[str, Any]) -> None:
         for row in summary["precision_recall"]
     ]
     title = f"True match: bounding-box IoU > {summary['min_overlap']:g}"
-    heads = ["n >=", "precision", "recall", "TP", "FP", "FN", "right pose"]
+    threshold = next(iter(summary["precision_recall"][0])).removeprefix("min_")
+    heads = [f"{threshold} >=", "precision", "recall", "TP", "FP", "FN", "right pose"]
     console.print(table_of(title, heads, rows))
     console.print(
         f"\n{summary['pairs']} pairs scored, {summary['true_pairs']} of them true. "
@@ -139,9 +144,9 @@ def show(console: Console, summary: dict[str, Any]) -> None:
             )
 
 
-def _row(point: "OperatingPoint", pose_precision: float) -> dict[str, float]:
+def _row(name: str, point: "OperatingPoint", pose_precision: float) -> dict[str, float]:
     return {
-        "min_inliers": int(point.threshold),
+        f"min_{name}": int(point.threshold),
         "precision": point.precision,
         "recall": point.recall,
         "true_positives": point.true_positives,

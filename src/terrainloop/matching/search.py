@@ -17,6 +17,7 @@ from terrainloop.matching.field import TINY, Field, Image, field_of, turn_field
 PIXELS_PER_LENGTH_SCALE = 2  # a finer field tells no more: the spectrum of the process ends there
 MAX_PIXELS = 96  # across; larger maps are searched at twice the spacing, and so on
 TURN = 1.0  # pixels that ground moves between two rotations, root mean square over the map
+CHUNK = 8  # groups at a time, so that they stay in the cache
 GROUP = 3  # rotations that share the sums of energies, which hardly change by a turn
 MIN_AREA = 20.0  # of shared ground, in squared length scales
 EVIDENT = 6.0  # r^2 in units of its mean, above which a pose is looked at: one in seventy
@@ -119,32 +120,33 @@ def search(source: SearchMap, target: SearchMap, count: int) -> Search:
         turned = _turned(source, spacing, size)
     stored = target.spectra(spacing, size)
     pixels = (max(source.length_scale, target.length_scale) / spacing) ** 2  # of a squared length scale
-    reach = int(np.ceil(APART * np.sqrt(pixels)))
-    null = np.full(len(turned.poses), np.nan)
-    tried, peaks = 0.0, []
-    for group, ground in enumerate(turned.ground):
-        start = GROUP * group
-        shared, energies = _energies(ground, stored, size)
+    turns, tried = len(turned.poses), 0.0
+    null = np.full(turns, np.nan)
+
+    def unwrapped(index: NDArray[np.int64], extent: int) -> NDArray[np.int64]:
+        return index - size * (index >= extent)  # shifts back stand at the far end
+
+    evident = [np.empty((4, 0))]  # surprise, rotation, row and column of poses that agree well
+    for start in range(0, turns, CHUNK * GROUP):
+        chunk = slice(start, start + CHUNK * GROUP)
+        shared, energies = _energies(turned.ground[start // GROUP :][:CHUNK], stored, size)
         enough = shared > MIN_AREA * pixels
-        admissible = np.count_nonzero(enough)
-        if not admissible:
-            continue
-        scale = np.where(enough, 1.0 / np.sqrt(energies + TINY), 0.0)
-        for k, product in enumerate(_products(turned.fields[start : start + GROUP], stored, size), start):
-            r = product * scale
-            evident = r * r * shared
-            sample = max(float(evident.sum()) / admissible, 1.0)
-            null[k] = sample
-            tried += admissible / pixels
-            rows, columns = np.nonzero((evident > EVIDENT * sample) & (r > 0))
-            surprises = surprise(r[rows, columns] ** 2, shared[rows, columns] / sample)
-            for peak in _two_peaks(surprises, rows, columns, reach):
-                row, column = int(rows[peak]), int(columns[peak])
-                dx, dy = column - size * (column >= field.x.shape[1]), row - size * (row >= field.x.shape[0])
-                T = field.metres_from_pixels @ se2(dx, dy, 0.0) @ turned.poses[k]
-                peaks.append((float(surprises[peak]), T))
-    peaks.sort(key=lambda peak: -peak[0])
-    return Search(_distinct([T for _, T in peaks], source, count), null * spacing**2, tried)
+        admissible = np.repeat(np.count_nonzero(enough, axis=(1, 2)), GROUP)
+        scale = np.repeat(enough / np.sqrt(energies), GROUP, axis=0)
+        shared = np.repeat(shared, GROUP, axis=0)
+        r = _products(turned.fields[chunk], stored, size) * scale
+        evidence = r * r * shared
+        sample = np.maximum(evidence.sum(axis=(1, 2)) / np.maximum(admissible, 1), 1.0).astype(np.float32)
+        null[chunk] = np.where(admissible > 0, sample, np.nan)
+        tried += admissible.sum() / pixels
+        at = np.nonzero((evidence > (EVIDENT * sample)[:, None, None]) & (r > 0))
+        surprises = surprise(r[at] ** 2, shared[at] / sample[at[0]])
+        evident.append(np.stack([surprises, at[0] + start, *map(unwrapped, at[1:], field.known.shape)]))
+    arc = 2 * np.pi * source.radius / spacing / max(turns, 1)
+    peaks = _distinct_peaks(np.concatenate(evident, axis=1), APART * np.sqrt(pixels), turns, arc, count)
+    metres = field.metres_from_pixels
+    places = [metres @ se2(column, row, 0.0) @ turned.poses[k] for k, row, column in peaks.tolist()]
+    return Search(places, null * spacing**2, tried)
 
 
 def same_place(T: Array, other: Array, source: SearchMap) -> bool:
@@ -154,25 +156,22 @@ def same_place(T: Array, other: Array, source: SearchMap) -> bool:
     return bool(max(apart, turned) < APART * source.length_scale)
 
 
-def _distinct(poses: list[Array], source: SearchMap, count: int) -> list[Array]:
-    """The first poses, none of them the same place as one before."""
-    kept: list[Array] = []
-    for T in poses:
-        if len(kept) < count and not any(same_place(T, other, source) for other in kept):
-            kept.append(T)
-    return kept
+def _distinct_peaks(poses: Array, apart: float, turns: int, arc: float, count: int) -> NDArray[np.int64]:
+    """Rotation, row and column (C, 3) of the most surprising poses, each `apart` pixels from those before.
 
-
-def _two_peaks(
-    values: NDArray[np.floating], rows: NDArray[np.int64], columns: NDArray[np.int64], reach: int
-) -> list[int]:
-    """Index of the largest value, and of the largest that lies further than `reach` pixels from it."""
-    if not len(values):
-        return []
-    first = int(values.argmax())
-    near = np.maximum(np.abs(rows - rows[first]), np.abs(columns - columns[first])) <= reach
-    second = int(np.where(near, -1.0, values).argmax())
-    return [first] if near[second] else [first, second]
+    Poses (4, N) are surprise, rotation out of `turns`, and shift. Sources are turned about their middle,
+    so that a shift is its way; from one rotation to the next ground moves by `arc` pixels.
+    """
+    surprises, rotation, row, column = poses
+    peaks: list[int] = []
+    while len(peaks) < count and surprises.max(initial=0.0) > 0:
+        best = int(surprises.argmax())
+        peaks.append(best)
+        turned = np.abs(rotation - rotation[best])
+        turned = np.minimum(turned, turns - turned) * arc
+        shifted = np.hypot(row - row[best], column - column[best])
+        surprises = np.where(np.maximum(shifted, turned) < apart, 0.0, surprises)
+    return poses[1:, peaks].T.astype(np.int64)
 
 
 def _products(fields: Spectra, stored: Spectra, size: int) -> Image:
@@ -181,11 +180,12 @@ def _products(fields: Spectra, stored: Spectra, size: int) -> Image:
 
 
 def _energies(ground: Spectra, stored: Spectra, size: int) -> tuple[Image, Image]:
-    """Shared pixels and the product of the energies over them, at every shift."""
-    sums = ground[[0, 0, 1]] * stored[[2, 3, 2]]
-    shared, energy, other_energy = fft.irfft2(sums, s=(size, size))
-    energies = energy * other_energy
-    return shared, np.maximum(energies, ROUNDING * energies.max())
+    """Shared pixels and the product of the energies over them (K, size, size), at every shift."""
+    shared, energy, other = fft.irfft2(ground[:, [0, 0, 1]] * stored[[2, 3, 2]], s=(size, size)).swapaxes(
+        0, 1
+    )
+    energies = energy * other
+    return shared, np.maximum(energies, ROUNDING * energies.max() + TINY)
 
 
 @dataclass(frozen=True, eq=False)

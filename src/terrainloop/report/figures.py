@@ -121,8 +121,8 @@ def figure_mission(
     return figure
 
 
-def figure_precision_recall(points: Sequence[OperatingPoint], title: str) -> Figure:
-    """Precision against recall, and both against the inlier threshold (paper, Figs. 8 and 9)."""
+def figure_precision_recall(points: Sequence[OperatingPoint], title: str, threshold: str) -> Figure:
+    """Precision against recall, and both against the threshold, named so (paper, Figs. 8 and 9)."""
     figure = Figure(figsize=(10, 4.5), layout="constrained")
     curve, by_threshold = figure.subplots(1, 2)
     recall, precision = [p.recall for p in points], [p.precision for p in points]
@@ -133,7 +133,7 @@ def figure_precision_recall(points: Sequence[OperatingPoint], title: str) -> Fig
     curve.set(xlabel="recall", ylabel="precision", title=title)
     by_threshold.plot(thresholds, precision, "o-", color=TARGET_COLOUR, markersize=4, label="precision")
     by_threshold.plot(thresholds, recall, "s--", color=SOURCE_COLOUR, markersize=4, label="recall")
-    by_threshold.set(xlabel="least number of inliers n", title="over the inlier threshold")
+    by_threshold.set(xlabel=threshold, title="over the threshold")
     by_threshold.legend()
     for axes in (curve, by_threshold):
         axes.set_ylim(-0.03, 1.03)
