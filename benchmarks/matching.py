@@ -8,6 +8,7 @@
 
 A mission is a folder with clouds and truth.tum ('terrainloop simulate' makes some); passes.csv beside them
 names sessions, of which only different ones are compared. Maps are kept in ~/.cache/terrainloop-benchmarks.
+With --figure F.png, null and errors also draw what was expected against what was observed.
 """
 
 import argparse
@@ -19,10 +20,12 @@ from collections import defaultdict
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import lru_cache, partial
 from itertools import combinations
+from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.random import SeedSequence
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
@@ -90,6 +93,11 @@ def compare_all(job):
         return [compare(query, stored[other], settings, pairs=pairs) for other in others]
 
 
+def processes():
+    # Threads of the maps' solver do not survive a fork.
+    return ProcessPoolExecutor(2, mp_context=get_context("spawn"))
+
+
 def judged(pool, folder, method):
     """Every pair of a mission that odometry does not join, and the truth about it."""
     submaps, records, poses, sessions = mapped(folder)
@@ -108,12 +116,12 @@ def judged(pool, folder, method):
     return judge(candidates, records, poses, sessions), turned
 
 
-def recall(folders):
+def recall(folders, _):
     print("| mission | method | " + " | ".join(f"IoU {a}-{b}: best, accepted" for a, b in BANDS), end="")
     print(" | same way | opposite | across | loops | wrong | disjoint | found by dense / sparse |")
     print("|---" * 11 + "|")
     total = defaultdict(list)
-    with ProcessPoolExecutor(2) as pool:
+    with processes() as pool:
         for folder in folders:
             for method in METHODS:
                 pairs, turned = judged(pool, folder, method)
@@ -132,7 +140,7 @@ def recall_row(pairs, turned):
     accepted = np.array([bool(p.candidate) for p in pairs])
     turn = np.array([turned[p.candidate.source, p.candidate.target] for p in pairs])
     dense = np.array([p.candidate.found_by == "dense" for p in pairs])
-    first_false = score[(overlap <= 0) | ~right & accepted & (overlap <= 0)].max(initial=-np.inf)
+    first_false = score[~right].max(initial=-np.inf)  # also where they do share ground
     row = []
     for low, high in BANDS:
         band = (overlap > low) & (overlap <= high)
@@ -165,11 +173,11 @@ def cells(row):
     )
 
 
-def null(folders):
+def null(folders, figure):
     """Expected and observed false alarms over pairs of submaps of different missions."""
     loosened = Settings.model_validate({"match": {"max_false_loops": 1e6}})  # so that every pair is refined
     scores, accepted = defaultdict(list), 0
-    with ProcessPoolExecutor(2) as pool:
+    with processes() as pool:
         for a, b in combinations(folders, 2):
             others = list(range(len(mapped(b)[0])))
             jobs = [(2, 6, loosened, a, i, b, others, 1.0) for i in range(len(mapped(a)[0]))]
@@ -191,19 +199,36 @@ def null(folders):
         values = np.asarray(values)
         ratios = [f"{(values >= -np.log10(x)).sum()} / {-np.expm1(-x) * len(values):.1f}" for x in levels]
         print(f"| {name} | {len(values)} | {' | '.join(ratios)} | {values.max():.1f} |")
+    if figure:
+        drawing = Figure(figsize=(6, 4.5), layout="constrained")
+        axes = drawing.subplots()
+        score = np.linspace(-0.5, 4.5, 200)
+        for values in scores.values():
+            observed = [(np.asarray(values) >= s).mean() for s in score]
+            axes.plot(score, observed, lw=0.8, color="0.6")
+        everything = np.concatenate(list(scores.values()))
+        axes.plot(score, [(everything >= s).mean() for s in score], lw=2, label="observed")
+        axes.plot(score, -np.expm1(-(10.0**-score)), "k--", label="expected")
+        axes.set(
+            yscale="log", ylim=(0.5 / count, 1.2), xlabel="score", title=f"{count} pairs that share nothing"
+        )
+        axes.set_ylabel("share of pairs at or above it (grey: by worlds)")
+        axes.legend()
+        drawing.savefig(figure, dpi=110)
 
 
-def errors(folders):
+def errors(folders, figure):
     """Errors of accepted loops of the right place, and their squares normalised by the covariance."""
     print("| mission | loops | x-y, m | z, m | yaw, deg ", end="")
     print("| NEES / 6 | x, y, yaw / 3 | z, roll, pitch / 3 | within 95 % |")
     print("|---" * 9 + "|")
-    with ProcessPoolExecutor(2) as pool:
+    all_squares = defaultdict(list)
+    with processes() as pool:
         for folder in folders:
             pairs, _ = judged(pool, folder, "both, evidence (default)")
             _, records, poses, _ = mapped(folder)
             order = {record.name: index for index, record in enumerate(records)}
-            squares, plane, rest = [], [], []
+            squares, plane, rest = all_squares[folder.name], [], []
             good = [p for p in pairs if p.candidate and p.pose_is_right]
             for p in good:
                 c = p.candidate
@@ -226,8 +251,22 @@ def errors(folders):
                 flush=True,
             )
 
+    if figure:
+        drawing = Figure(figsize=(6, 4.5), layout="constrained")
+        axes = drawing.subplots()
+        for squares in all_squares.values():
+            axes.plot(np.sort(squares), (np.arange(len(squares)) + 0.5) / len(squares), lw=0.8, color="0.6")
+        together = np.sort(np.concatenate(list(all_squares.values())))
+        axes.plot(together, (np.arange(len(together)) + 0.5) / len(together), lw=2, label="observed")
+        square = np.linspace(0, 30, 200)
+        axes.plot(square, chi2.cdf(square, 6), "k--", label="chi-squared, 6 degrees of freedom")
+        axes.set(xlim=(0, 30), xlabel="normalised squared error", ylabel="share of loops (grey: by mission)")
+        axes.set_title(f"{len(together)} accepted loops")
+        axes.legend()
+        drawing.savefig(figure, dpi=110)
 
-def query_time(folders):
+
+def query_time(folders, _):
     """The last submap against 14 others; stages are timed on one thread."""
     cv2.setNumThreads(1)
     submaps = mapped(folders[0])[0]
@@ -268,7 +307,7 @@ def query_time(folders):
         print(f"  {name}: {1e3 * spent[name] / len(stored):.2f} ms a pair")
 
 
-def sensors(_):
+def sensors(_, __):
     """Stereo submaps against LiDAR submaps of one simulated world, driven along one path."""
     seed, drive = SeedSequence(7), 112.0
     print("| world | pairs | IoU > 0.1 | found | wrong | share nothing | accepted of these | error |")
@@ -322,9 +361,10 @@ def main():
     )
     parser.add_argument("what", choices=("recall", "null", "errors", "time", "sensors"))
     parser.add_argument("folders", nargs="*", type=Path)
+    parser.add_argument("--figure", type=Path, help="of what null or errors found, PNG")
     args = parser.parse_args()
     run = {"recall": recall, "null": null, "errors": errors, "time": query_time, "sensors": sensors}
-    run[args.what](args.folders)
+    run[args.what](args.folders, args.figure)
 
 
 if __name__ == "__main__":

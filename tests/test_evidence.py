@@ -12,6 +12,7 @@ from terrainloop.geometry import inverse, se2, se3, transform, yaw_of
 from terrainloop.matching.covariance import BLOCK, block_covariance
 from terrainloop.matching.evidence import (
     NO_EVIDENCE,
+    TAIL,
     log_poses,
     surprise,
     surprise_of_both,
@@ -93,8 +94,17 @@ def test_inliers_can_only_help():
 
 
 def test_the_number_of_poses_goes_with_what_was_tried():
-    assert log_poses(1e6) - log_poses(1e4) == pytest.approx(np.log(100))
-    assert log_poses(0.0) == 0.0
+    none = np.empty(0)
+    assert log_poses(1e6, none) - log_poses(1e4, none) == pytest.approx(np.log(100))
+    assert log_poses(0.0, none) == 0.0
+
+
+def test_like_places_count_as_poses():
+    usual = log_poses(1e5, np.array([9.0, 8.0, 7.0]))
+    assert usual == log_poses(1e5, np.empty(0))
+    abounding = log_poses(1e5, np.linspace(25.0, 20.0, 10))
+    assert abounding == pytest.approx(TAIL * 20 + np.log(10))
+    assert abounding > usual
 
 
 # --- the covariance of a fit

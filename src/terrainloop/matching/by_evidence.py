@@ -28,6 +28,7 @@ from terrainloop.matching.refine import Refinement, refine
 from terrainloop.matching.search import APART, MIN_AREA, Search, same_place, search
 from terrainloop.matching.ssd import compute_ssd
 
+PLACES = 11  # of the dense search: the best, and ten that tell how rare such a place is
 DENSE, SPARSE = 2, 1  # hypotheses of either kind that are refined
 LOOKED_AT = 6  # inlier sets, of which the best are refined
 GAIN = 3.0  # by which refining raises the surprise of a hypothesis, at most
@@ -91,6 +92,10 @@ class _Pair:
         return better if better.surprise > hypothesis.surprise else hypothesis
 
     @property
+    def log_poses(self) -> float:
+        return log_poses(self.found.tried, self.found.surprises[1:])
+
+    @property
     def maps(self) -> tuple[GradientMap, GradientMap]:
         return self.source.gradient_map, self.target.gradient_map
 
@@ -110,7 +115,7 @@ def compare_by_evidence(
     pairs : float
         Compared in the mission.
     """
-    found = search(source.search_map, target.search_map, DENSE)
+    found = search(source.search_map, target.search_map, PLACES)
     if found.tried == 0:
         return _incomparable(source, target, "too little ground: the maps cannot share enough to be compared")
     radius = inlier_radius_of(settings, target.gradient_map)
@@ -120,7 +125,7 @@ def compare_by_evidence(
         return _incomparable(source, target, "featureless: the ground shows nothing that could agree")
 
     allowed = settings.match.max_false_loops
-    needed = log_poses(found.tried) + np.log(pairs / allowed)
+    needed = pair.log_poses + np.log(pairs / allowed)
     hypotheses = [pair.refined(h) if h.surprise * GAIN > needed else h for h in hypotheses]
     hypotheses = [
         h if h.agreement.correlation >= MIN_CORRELATION else replace(h, surprise=0.0) for h in hypotheses
@@ -135,14 +140,14 @@ def compare_by_evidence(
         pair,
         best,
         settled=None if objection else settled,
-        score=(best.surprise - log_poses(found.tried)) / np.log(10.0),
+        score=(best.surprise - pair.log_poses) / np.log(10.0),
         reason=f"{objection}: {reason}" if objection else reason,
     )
 
 
 def _hypotheses(pair: _Pair, settings: Settings) -> list[Hypothesis]:
     """The best places of the dense search, and the best of the keypoints that are not among them."""
-    hypotheses = [pair.judge(T, "dense") for T in pair.found.places]
+    hypotheses = [pair.judge(T, "dense") for T in pair.found.places[:DENSE]]
     sparse = sorted((pair.judge(T, "sparse") for T in _sparse_poses(pair, settings)), key=_surprise)
     for proposed in sparse[-SPARSE:]:
         if not any(pair.same_place(proposed.T_target_source, h.T_target_source) for h in hypotheses):
@@ -170,7 +175,7 @@ def _objection(
     if best.surprise < needed:
         return "chance explains it"
     T = best.T_target_source
-    doubtful = max(RIVAL * best.surprise, log_poses(pair.found.tried) - np.log(RIVAL_BY_CHANCE))
+    doubtful = max(RIVAL * best.surprise, pair.log_poses - np.log(RIVAL_BY_CHANCE))
     if any(h.surprise > doubtful and not pair.same_place(h.T_target_source, T) for h in hypotheses):
         return "ambiguous, another place fits as well"
     if settled is None or not pair.same_place(settled.T_target_source, T):

@@ -70,6 +70,18 @@ def surprise_of_both(field: float, inliers: float) -> float:
     return max(field, together - float(np.log1p(together)), float(np.log(2.0))) - float(np.log(2.0))
 
 
-def log_poses(tried: float) -> float:
-    """Natural logarithm of the number of independent poses in those that a search tried."""
-    return float(np.log(max(INDEPENDENT_POSES * tried, 1.0)))
+def log_poses(tried: float, others: NDArray[np.floating]) -> float:
+    """Natural logarithm of the number of independent poses among those that a search tried.
+
+    Where like places abound, as on ripples, the pair itself shows more: if k places besides the best
+    reach a surprise s, it is as if there were k exp(s) poses.
+
+    Parameters
+    ----------
+    tried : float
+        See `terrainloop.matching.search.Search`.
+    others : array, (K,)
+        Surprises of the best places but the best, by the formula, falling.
+    """
+    measured = TAIL * others[-1] + np.log(len(others)) if len(others) else 0.0
+    return float(max(np.log(max(INDEPENDENT_POSES * tried, 1.0)), measured))

@@ -38,6 +38,8 @@ class Search:
     ----------
     places : list of arrays, (3, 3)
         T_target_source, SE(2), of places that differ from one another, best first.
+    surprises : array, (P,)
+        Of the places (see `terrainloop.matching.evidence.surprise`).
     null_area : array, (K,)
         For each of K rotations, evenly spaced from 0 to 2 pi, the ground that counts as one
         independent sample, m^2; NaN where no shift shares enough ground.
@@ -46,6 +48,7 @@ class Search:
     """
 
     places: list[Array]
+    surprises: Array
     null_area: Array
     tried: float
 
@@ -143,10 +146,11 @@ def search(source: SearchMap, target: SearchMap, count: int) -> Search:
         surprises = surprise(r[at] ** 2, shared[at] / sample[at[0]])
         evident.append(np.stack([surprises, at[0] + start, *map(unwrapped, at[1:], field.known.shape)]))
     arc = 2 * np.pi * source.radius / spacing / max(turns, 1)
-    peaks = _distinct_peaks(np.concatenate(evident, axis=1), APART * np.sqrt(pixels), turns, arc, count)
+    poses = np.concatenate(evident, axis=1)
+    peaks = _distinct_peaks(poses, APART * np.sqrt(pixels), turns, arc, count)
     metres = field.metres_from_pixels
-    places = [metres @ se2(column, row, 0.0) @ turned.poses[k] for k, row, column in peaks.tolist()]
-    return Search(places, null * spacing**2, tried)
+    places = [metres @ se2(column, row, 0.0) @ turned.poses[int(k)] for _, k, row, column in peaks.T.tolist()]
+    return Search(places, peaks[0], null * spacing**2, tried)
 
 
 def same_place(T: Array, other: Array, source: SearchMap) -> bool:
@@ -156,8 +160,8 @@ def same_place(T: Array, other: Array, source: SearchMap) -> bool:
     return bool(max(apart, turned) < APART * source.length_scale)
 
 
-def _distinct_peaks(poses: Array, apart: float, turns: int, arc: float, count: int) -> NDArray[np.int64]:
-    """Rotation, row and column (C, 3) of the most surprising poses, each `apart` pixels from those before.
+def _distinct_peaks(poses: Array, apart: float, turns: int, arc: float, count: int) -> Array:
+    """The most surprising poses (4, C), each `apart` pixels from those before.
 
     Poses (4, N) are surprise, rotation out of `turns`, and shift. Sources are turned about their middle,
     so that a shift is its way; from one rotation to the next ground moves by `arc` pixels.
@@ -171,7 +175,7 @@ def _distinct_peaks(poses: Array, apart: float, turns: int, arc: float, count: i
         turned = np.minimum(turned, turns - turned) * arc
         shifted = np.hypot(row - row[best], column - column[best])
         surprises = np.where(np.maximum(shifted, turned) < apart, 0.0, surprises)
-    return poses[1:, peaks].T.astype(np.int64)
+    return poses[:, peaks]
 
 
 def _products(fields: Spectra, stored: Spectra, size: int) -> Image:
