@@ -120,13 +120,13 @@ def summarise(candidates: Sequence["LoopCandidate"], records: Sequence["SubmapRe
 def show(console: Console, detector: "LoopDetector", records: Sequence["SubmapRecord"], output: Path) -> None:
     """The run as a table and a few sentences."""
     loops = [candidate for candidate in detector.candidates if candidate]
-    columns = ("source", "target", "x, m", "y, m", "z, m", "yaw, deg", "+/- m", "inliers", "score", "overlap")
+    columns = ("source", "target", "x, m", "y, m", "z, m", "yaw", "+/- m", "score", "shared")
     console.print(table_of("Loop closures", columns, [_row(loop) for loop in loops]))
     usable = sum(record.status == "ok" for record in records)
     console.print(
         f"\n{count_of(len(loops), 'loop closure')} in {count_of(len(detector.candidates), 'pair')} "
         f"of {count_of(usable, 'submap')}. "
-        "The transform takes points of source into the frame of target."
+        "The transform takes points of source into the frame of target; yaw in degrees."
     )
     for count, kind in rejections(detector.candidates):
         console.print(f"  {count_of(count, 'pair')} rejected: {kind}")
@@ -160,7 +160,6 @@ def _row(loop: "LoopCandidate") -> list[str]:
         f"{z:.2f}",
         f"{np.degrees(yaw):.1f}",
         f"{spread:.2f}",
-        str(loop.inliers),
         f"{loop.score:.1f}",
         f"{loop.overlap:.0%}",
     ]
