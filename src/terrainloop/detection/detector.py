@@ -89,21 +89,15 @@ class LoopDetector:
         """As `add`, for a submap that is mapped already (see `map_submap`)."""
         self._check_name(query.name)
         stored = list(self.submaps.values())[: max(0, len(self.submaps) - self.settings.skip_recent)]
-        pairs = self.expected_pairs or self._open_ended(len(stored))
+        # A mission may go on for ever: its k-th query, which finds k stored, may spend 1 / (k (k + 1)) of
+        # `max_false_loops`, all queries together 1.
+        pairs = self.expected_pairs or len(stored) ** 2 * (len(stored) + 1)
         work = partial(compare, query, settings=self.settings, pairs=pairs)
         with ThreadPoolExecutor(self.workers) as pool:
             candidates = list(pool.map(work, stored))
         self.submaps[query.name] = query
         self.candidates += candidates
         return [candidate for candidate in candidates if candidate]
-
-    def _open_ended(self, count: int) -> float:
-        """Pairs that share out `max_false_loops` when a mission may go on for ever.
-
-        The k-th query may spend 1 / (k (k + 1)) of it, all queries together 1.
-        """
-        k = len({candidate.source for candidate in self.candidates}) + 1
-        return count * k * (k + 1)
 
     def _check_name(self, name: str) -> None:
         if name in self.submaps:

@@ -74,7 +74,7 @@ def detect_mission(
             mend="mend the clouds or name another folder",
         )
     compared = max(0, len(usable) - settings.skip_recent)
-    expected_pairs = compared * (compared - 1) // 2 if compared > 1 else None
+    expected_pairs = compared * (compared - 1) // 2
     detector = LoopDetector(settings, parameters=parameters, expected_pairs=expected_pairs, workers=workers)
     with threadpool_limits(1, user_api="blas"):
         for done, mapped in enumerate(usable, start=1):

@@ -108,12 +108,7 @@ def compare_by_evidence(
 ) -> LoopCandidate:
     """Search, propose, refine; take the pose that is hardest to explain by chance, and decide.
 
-    Parameters
-    ----------
-    source, target : MappedSubmap
-    settings : Settings
-    pairs : float
-        Compared in the mission.
+    What it takes is what `terrainloop.matching.register.compare` does.
     """
     found = search(source.search_map, target.search_map, PLACES)
     if found.tried == 0:

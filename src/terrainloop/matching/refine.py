@@ -81,7 +81,8 @@ class Refinement:
         """The two poses (3, 3) a distance in metres away, in the direction that the gradients tell least."""
         radius = self._radius
         _, normal = self._solve(self.motion / (1.0, 1.0, radius, 1.0, 1.0))
-        x, y, turn = np.linalg.eigh(np.linalg.inv(np.linalg.pinv(normal, hermitian=True)[:3, :3]))[1][:, 0]
+        slopes = np.linalg.solve(normal[3:, 3:], normal[3:, :3])
+        x, y, turn = np.linalg.eigh(normal[:3, :3] - normal[:3, 3:] @ slopes)[1][:, 0]
         away = distance * np.array([x, y, turn / radius])
         return self._move(*away) @ self.T_target_source, self._move(*-away) @ self.T_target_source
 
@@ -163,8 +164,8 @@ def _linearise(source: GradientMap, target: GradientMap, T: Array, places: int) 
     known = np.flatnonzero(shared)
     if len(known) < FEWEST:
         return None
-    chosen = known[:: -(-len(known) // places)]
-    ground = ground_of(shared, target, step)[:: -(-len(known) // places)]
+    every = -(-len(known) // places)
+    chosen, ground = known[::every], ground_of(shared, target, step)[::every]
 
     def at_places(images: NDArray[Any]) -> Array:
         return images.reshape(len(images), -1)[:, chosen].astype(float)

@@ -185,9 +185,8 @@ def _products(fields: Spectra, stored: Spectra, size: int) -> Image:
 
 def _energies(ground: Spectra, stored: Spectra, size: int) -> tuple[Image, Image]:
     """Shared pixels and the product of the energies over them (K, size, size), at every shift."""
-    shared, energy, other = fft.irfft2(ground[:, [0, 0, 1]] * stored[[2, 3, 2]], s=(size, size)).swapaxes(
-        0, 1
-    )
+    sums = fft.irfft2(ground[:, [0, 0, 1]] * stored[[2, 3, 2]], s=(size, size))
+    shared, energy, other = sums.swapaxes(0, 1)
     energies = energy * other
     return shared, np.maximum(energies, ROUNDING * energies.max() + TINY)
 
