@@ -112,7 +112,9 @@ def compare_by_evidence(
     """
     found = search(source.search_map, target.search_map, PLACES)
     if found.tried == 0:
-        return _incomparable(source, target, "too little ground: the maps cannot share enough to be compared")
+        length_scale = max(source.search_map.length_scale, target.search_map.length_scale)
+        least = f"{MIN_AREA * length_scale**2:.3g} m^2 at a length scale of {length_scale:.2g} m"
+        return _incomparable(source, target, f"too little ground: they would have to share {least}")
     radius = inlier_radius_of(settings, target.gradient_map)
     pair = _Pair(source, target, found, associate(source.features, target.features), radius)
     hypotheses = _hypotheses(pair, settings)
