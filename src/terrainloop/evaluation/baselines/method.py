@@ -101,10 +101,10 @@ class Scale:
     def of(cls, submaps: Sequence[Submap]) -> "Scale":
         """Measured on the submaps of a mission."""
         sides = [np.sqrt(np.ptp(submap.points[:, :2], axis=0).prod()) for submap in submaps]
-        spacings = [
-            np.median(KDTree(s.points).query(s.points[:: max(1, len(s) // 1000)], k=2)[0][:, 1])
-            for s in submaps
-        ]
+        spacings = []
+        for submap in submaps:
+            some = submap.points[:: max(1, len(submap) // 1000)]
+            spacings.append(np.median(np.asarray(KDTree(submap.points).query(some, k=2)[0])[:, 1]))
         return cls(spacing=float(np.median(spacings)), side=float(np.median(sides)))
 
 
