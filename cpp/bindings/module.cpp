@@ -1,5 +1,3 @@
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
@@ -8,51 +6,23 @@
 #include <cmath>
 #include <memory>
 #include <optional>
-#include <string>
 #include <tuple>
 #include <utility>
 #include <vector>
 
+#include "arrays.hpp"
 #include "terrainloop/gp.hpp"
 #include "terrainloop/likelihood.hpp"
 #include "terrainloop/surf.hpp"
 
-namespace nb = nanobind;
-using namespace nb::literals;
-
 namespace terrainloop {
 namespace {
-
-using AnyArray = nb::ndarray<nb::ro, nb::device::cpu>;
-
-template <typename T>
-ImageView<T> view(const AnyArray& array, const char* name, const char* dtype) {
-  const std::string subject(name);
-  if (array.ndim() != 2) throw nb::value_error((subject + " must be 2-D").c_str());
-  if (array.dtype() != nb::dtype<T>()) throw nb::value_error((subject + " must be " + dtype).c_str());
-  if (array.size() == 0) throw nb::value_error((subject + " must not be empty").c_str());
-  const std::size_t rows = array.shape(0), cols = array.shape(1);
-  const bool packed = (cols == 1 || array.stride(1) == 1) &&
-                      (rows == 1 || array.stride(0) == static_cast<std::int64_t>(cols));
-  if (!packed)
-    throw nb::value_error((subject + " must be C-contiguous: use numpy.ascontiguousarray").c_str());
-  return {static_cast<const T*>(array.data()), static_cast<int>(rows), static_cast<int>(cols)};
-}
 
 ImageView<float> image_view(const AnyArray& array) {
   const ImageView<float> image = view<float>(array, "image", "float32");
   if (!std::all_of(image.data, image.data + array.size(), [](float v) { return std::isfinite(v); }))
     throw nb::value_error("image must be finite");
   return image;
-}
-
-/// A NumPy array that takes over the vector's memory.
-template <typename T>
-auto to_numpy(std::vector<T> values, std::size_t rows, std::size_t cols) {
-  auto owned = std::make_unique<std::vector<T>>(std::move(values));
-  T* data = owned->data();
-  nb::capsule owner(owned.release(), [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
-  return nb::ndarray<nb::numpy, T, nb::ndim<2>>(data, {rows, cols}, owner);
 }
 
 nb::tuple surf_extract(const AnyArray& image, std::optional<AnyArray> mask, double threshold, int octaves,
@@ -81,8 +51,8 @@ nb::tuple surf_extract(const AnyArray& image, std::optional<AnyArray> mask, doub
     for (const auto& d : found.descriptors) descriptors.insert(descriptors.end(), d.begin(), d.end());
   }
   const std::size_t count = keypoints.size() / 6;
-  return nb::make_tuple(to_numpy(std::move(keypoints), count, 6),
-                        to_numpy(std::move(descriptors), count, 64));
+  return nb::make_tuple(to_numpy(std::move(keypoints), {count, 6}),
+                        to_numpy(std::move(descriptors), {count, 64}));
 }
 
 auto fast_hessian(const AnyArray& image, int filter_size) {
@@ -93,10 +63,9 @@ auto fast_hessian(const AnyArray& image, int filter_size) {
     nb::gil_scoped_release release;
     response = surf::fast_hessian(pixels, filter_size);
   }
-  return to_numpy(std::move(response), pixels.rows, pixels.cols);
+  return to_numpy(std::move(response),
+                  {static_cast<std::size_t>(pixels.rows), static_cast<std::size_t>(pixels.cols)});
 }
-
-using Doubles = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 
 gp::Points points_view(const Doubles& xy, const Doubles& elevation, const Doubles& noise) {
   if (xy.ndim() != 2 || xy.shape(1) != 2) throw nb::value_error("xy must be (N, 2)");
@@ -153,7 +122,7 @@ auto gp_noise_ratio(const Doubles& xy, const Doubles& elevation, double cell, in
     nb::gil_scoped_release release;
     gp::noise_ratio(points.xy, points.elevation, points.count, cell, ratio.data(), threads);
   }
-  return to_numpy(std::move(ratio), points.count, 1);
+  return to_numpy(std::move(ratio), {points.count, 1});
 }
 
 nb::tuple gp_block_likelihood(const std::vector<std::tuple<Doubles, Doubles, Doubles>>& surfaces,
@@ -203,4 +172,5 @@ NB_MODULE(TERRAINLOOP_MODULE, module) {
   module.def("gp_block_likelihood", &terrainloop::gp_block_likelihood, "surfaces"_a, nb::kw_only(),
              "length_scale"_a, "variance"_a, "noise"_a, "side"_a, "work"_a, "threads"_a = 1);
   module.def("fast_hessian", &terrainloop::fast_hessian, "image"_a, "filter_size"_a);
+  terrainloop::bind_matching(module);
 }

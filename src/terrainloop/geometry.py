@@ -72,13 +72,16 @@ def fit_se2(source: ArrayLike, target: ArrayLike) -> Array:
     array, (..., 3, 3)
         T_target_source minimising the sum of squared distances |target - T source|^2.
     """
-    source, target = np.asarray(source, dtype=float), np.asarray(target, dtype=float)
-    source_centroid, target_centroid = source.mean(axis=-2), target.mean(axis=-2)
-    s, t = source - source_centroid[..., None, :], target - target_centroid[..., None, :]
-    cross = (s[..., 0] * t[..., 1] - s[..., 1] * t[..., 0]).sum(-1)
-    yaw = np.arctan2(cross, (s * t).sum((-2, -1)))
-    c, sn = np.cos(yaw), np.sin(yaw)
-    T = np.zeros((*yaw.shape, 3, 3))
-    T[..., 0, 0], T[..., 0, 1], T[..., 1, 0], T[..., 1, 1], T[..., 2, 2] = c, -sn, sn, c, 1.0
-    T[..., :2, 2] = target_centroid - (T[..., :2, :2] @ source_centroid[..., None])[..., 0]
+    # The plane as complex numbers: a rotation is a product, and s* t = s . t + i s x t.
+    source, target = (np.asarray(points, dtype=float) for points in (source, target))
+    source, target = (points[..., 0] + 1j * points[..., 1] for points in (source, target))
+    source_centroid, target_centroid = source.mean(axis=-1), target.mean(axis=-1)
+    s, t = source - source_centroid[..., None], target - target_centroid[..., None]
+    turn = (s.conj() * t).sum(axis=-1)
+    turn = np.where(turn == 0, 1.0, turn) / np.where(turn == 0, 1.0, np.abs(turn))
+    shift = target_centroid - turn * source_centroid
+    T = np.zeros((*turn.shape, 3, 3))
+    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2] = turn.real, -turn.imag, shift.real
+    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2] = turn.imag, turn.real, shift.imag
+    T[..., 2, 2] = 1.0
     return T

@@ -1,9 +1,12 @@
 """The C++ core. Arrays must be C-contiguous, of the stated type, finite and not empty; else ValueError."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+_Array = NDArray[np.float64]
 
 VARIANT: str
 """Which build of the core this is: native, portable, x86-64-v2, x86-64-v3 or x86-64-v4."""
@@ -79,4 +82,81 @@ def gp_block_likelihood(
     """-log p of (length scale, variance, noise) and its derivatives by their logarithms.
 
     From (xy, elevation, relative noise) of each surface; then the numbers of blocks, components and points.
+    """
+
+LANES: int
+"""Groups of rotations that the search treats side by side."""
+
+def search_spectra(images: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Conjugate half spectra of pairs of images (groups, turns, 2, n, n), zero beyond n, for the search.
+
+    They are (groups / LANES, turns, 2, size, size / 2 + 1, 2, LANES): real and imaginary parts, then the
+    groups side by side. The size is even, with no prime factors but 2, 3 and 5.
+    """
+
+def search_correlate(
+    fields: NDArray[np.float32],
+    ground: NDArray[np.float32],
+    stored: NDArray[np.float32],
+    *,
+    least_shared: float,
+    evident: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Correlations of a turned field and another, at every rotation and every (cyclic) shift.
+
+    Parameters
+    ----------
+    fields, ground : array
+        What `search_spectra` gives for (x, y) and, without the axis of turns, (known ground, energy).
+    stored : array, (4, size, size / 2 + 1, 2)
+        Half spectra of the other field's x, y, known ground and energy.
+    least_shared : float
+        Pixels that a shift has to share.
+    evident : float
+        r^2 in units of its mean, above which a pose is reported.
+
+    Returns
+    -------
+    evident : array, (N, 5)
+        Rotation (group * turns + turn), row, column, r^2 and the independent samples in the shared ground,
+        of poses with r > 0 that agree better than the shifts beside them.
+    sample : array, (K,)
+        For each rotation the pixels that count as one sample; NaN where no shift shares enough.
+    admissible : array, (K,)
+        For each rotation the shifts that share enough.
+    """
+
+def turn_field(
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    known: NDArray[np.float32],
+    affine: NDArray[np.float64],
+    *,
+    rows: int,
+    cols: int,
+) -> NDArray[np.float32]:
+    """x, y and known ground (3, rows, cols) of a vector field, through an affine map (3, 3) of pixels."""
+
+def inlier_counts(
+    source: NDArray[np.float64],
+    target: NDArray[np.float64],
+    motions: NDArray[np.float64],
+    radius: float,
+) -> NDArray[np.int32]:
+    """How many of the associations (A, 2) each motion (cos, sin, x, y) (K, 4) brings within the radius."""
+
+def settle(
+    source: tuple[Any, ...],
+    target: tuple[Any, ...],
+    T_target_source: NDArray[np.float64],
+    *,
+    step: int,
+    places: int,
+    steps: int,
+    tolerance: float,
+) -> tuple[_Array, _Array, _Array, _Array, _Array, _Array, _Array] | None:
+    """The pose that `terrainloop.matching.refine.refine` seeks, and what its `Refinement` holds.
+
+    A map is (gradient x, gradient y, gradient variance, mask as uint8, origin, resolution). None where
+    too little ground is shared.
     """

@@ -31,7 +31,6 @@ from terrainloop.matching.ssd import compute_ssd
 PLACES = 11  # of the dense search: the best, and ten that tell how rare such a place is
 DENSE, SPARSE = 2, 1  # hypotheses of either kind that are refined
 LOOKED_AT = 6  # inlier sets, of which the best are refined
-GAIN = 3.0  # by which refining raises the surprise of a hypothesis, at most
 RIVAL = 0.5  # share of the best place's surprise at which another place casts doubt on it,
 RIVAL_BY_CHANCE = 0.01  # unless as good a one turns up by chance in more pairs than that
 MIN_CORRELATION = 0.25  # large maps whose sensors leave like traces agree a little everywhere
@@ -40,7 +39,7 @@ UNKNOWN = np.full((3, 3), np.nan)
 
 FoundBy = Literal["dense", "sparse"]
 
-refine_roughly = partial(refine, places=2000, tolerance=0.02)
+refine_roughly = partial(refine, places=2000, steps=3, tolerance=0.02)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +122,9 @@ def compare_by_evidence(
 
     allowed = settings.match.max_false_loops
     needed = pair.log_poses + np.log(pairs / allowed)
-    hypotheses = [pair.refined(h) if h.surprise * GAIN > needed else h for h in hypotheses]
     hypotheses = [
-        h if h.agreement.correlation >= MIN_CORRELATION else replace(h, surprise=0.0) for h in hypotheses
+        h if h.agreement.correlation >= MIN_CORRELATION else replace(h, surprise=0.0)
+        for h in map(pair.refined, hypotheses)
     ]
     best = max(hypotheses, key=_surprise)
     settled = refine(*pair.maps, best.T_target_source) if best.surprise >= needed else None

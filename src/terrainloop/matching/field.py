@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from terrainloop import _core
 from terrainloop.geometry import Array, inverse
 from terrainloop.gradient_map import GradientMap
 
@@ -116,10 +117,9 @@ def turn_field(field: Field, affine: Array, size: tuple[int, int]) -> tuple[Imag
     size : tuple of int
         Columns and rows of the result.
     """
-    known = (_warp(field.known, affine, size, cv2.INTER_LINEAR) > 0.5).astype(np.float32)
-    x, y = (_warp(image, affine, size, cv2.INTER_CUBIC) * known for image in (field.x, field.y))
-    c, s = np.array([affine[0, 0], affine[0, 1]], dtype=np.float32) / np.hypot(affine[0, 0], affine[0, 1])
-    return c * x - s * y, s * x + c * y, known
+    columns, rows = size
+    x, y, known = _core.turn_field(field.x, field.y, field.known, affine, rows=rows, cols=columns)
+    return x, y, known
 
 
 def agreement_at(source: Field, target: Field, T_target_source: Array) -> Agreement:

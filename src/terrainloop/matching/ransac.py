@@ -8,13 +8,14 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from terrainloop import _core
 from terrainloop.config import Settings
 from terrainloop.geometry import Array, fit_se2
 from terrainloop.gradient_map import GradientMap
 from terrainloop.matching.correspondences import Associations
 from terrainloop.matching.ssd import Ssd, compute_ssd
 
-CHUNK = 30_000  # distances evaluated at a time, so that they stay in the cache
+CHUNK = 32  # inlier sets looked at together: few are asked for
 MAX_VERIFIED = 200  # inlier sets whose h is computed, which bounds the time of a pair
 
 
@@ -128,16 +129,13 @@ def _distinct_by_falling_count(
     associations: Associations, T: Array, inlier_radius: float
 ) -> Iterator[NDArray[np.bool_]]:
     """Inlier sets of two or more, largest first, in the order of the draws, none of them twice."""
-    step = max(1, CHUNK // len(associations))
-    chunks = (T[start : start + step] for start in range(0, len(T), step))
-    counts = np.concatenate(
-        [get_inliers(associations, chunk, inlier_radius).sum(1) for chunk in chunks] or [[]]
-    )
+    motions = np.stack([T[:, 0, 0], T[:, 1, 0], T[:, 0, 2], T[:, 1, 2]], axis=1)
+    counts = _core.inlier_counts(associations.source, associations.target, motions, inlier_radius)
     order = np.argsort(-counts, kind="stable")
     order = order[: np.count_nonzero(counts >= 2)]
     seen = set()
-    for start in range(0, len(order), step):
-        for inliers in get_inliers(associations, T[order[start : start + step]], inlier_radius):
+    for start in range(0, len(order), CHUNK):
+        for inliers in get_inliers(associations, T[order[start : start + CHUNK]], inlier_radius):
             key = inliers.tobytes()
             if key not in seen:
                 seen.add(key)

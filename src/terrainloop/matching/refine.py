@@ -4,18 +4,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from terrainloop import _core
 from terrainloop.geometry import Array, se2
 from terrainloop.gradient_map import GradientMap
 from terrainloop.matching.covariance import block_covariance
-from terrainloop.matching.ssd import ground_of, shared_ground, warp
 
-STEPS = 10
-CAUCHY = 2.5  # robust standard deviations at which a residual counts half
-FEWEST = 50  # places
 PLACES_PER_LENGTH_SCALE = 3  # what lies between them, neighbours repeat
 USUAL_STRAIN = 0.004  # of a submap, standard deviation; what is assumed before the pair is seen,
 USUAL_STRAIN_SAMPLES = 3.0  # and how many samples that assumption is worth
@@ -71,12 +66,6 @@ class Refinement:
         seen = max(float(samples.sum()), 0.0)
         return (USUAL_STRAIN_SAMPLES * USUAL_STRAIN**2 + seen) / (USUAL_STRAIN_SAMPLES + len(samples))
 
-    def step(self) -> tuple[Array, float]:
-        """The pose (3, 3) one step of Gauss-Newton further, and how far that moves the ground, metres."""
-        dx, dy, turn = self._solve(self.motion)[0][:3]
-        moved = np.hypot(dx, dy) + abs(turn) * self._radius
-        return self._move(dx, dy, turn) @ self.T_target_source, float(moved)
-
     def weakest(self, distance: float) -> tuple[Array, Array]:
         """The two poses (3, 3) a distance in metres away, in the direction that the gradients tell least."""
         radius = self._radius
@@ -118,6 +107,7 @@ def refine(
     T_target_source: Array,
     *,
     places: int = 20_000,
+    steps: int = 10,
     tolerance: float = 1e-3,
 ) -> Refinement | None:
     """Minimise the weighted differences of the gradient vectors, from an alignment near the best.
@@ -136,6 +126,8 @@ def refine(
         SE(2), off by less than about half a length scale.
     places : int
         Looked at, at most.
+    steps : int
+        Of Gauss-Newton, at most.
     tolerance : float
         Motion below which it has settled, in length scales over the map.
 
@@ -144,57 +136,24 @@ def refine(
     Refinement or None
         None where the maps share too little ground.
     """
-    at = _linearise(source, target, T_target_source, places)
-    for _ in range(STEPS):
-        if at is None:
-            return None
-        T, moved = at.step()
-        at = _linearise(source, target, T, places)
-        if moved < tolerance * target.parameters.length_scale:
-            break
-    return at
-
-
-def _linearise(source: GradientMap, target: GradientMap, T: Array, places: int) -> Refinement | None:
-    """The problem at a pose; None if too little ground is shared."""
-    length_scale = target.parameters.length_scale
-    step = max(1, round(length_scale / PLACES_PER_LENGTH_SCALE / target.resolution))
-    both = shared_ground(source, target, T, step)
-    shared = cv2.erode(both.astype(np.uint8), np.ones((3, 3)), borderValue=0).astype(bool)  # has slopes
-    known = np.flatnonzero(shared)
-    if len(known) < FEWEST:
-        return None
-    every = -(-len(known) // places)
-    chosen, ground = known[::every], ground_of(shared, target, step)[::every]
-
-    def at_places(images: NDArray[Any]) -> Array:
-        return images.reshape(len(images), -1)[:, chosen].astype(float)
-
-    warped = [warp(image, source, target, T, step) for image in (source.gradient_x, source.gradient_y)]
-    field = np.tensordot(T[:2, :2], np.stack(warped), axes=1)  # (2, rows, columns), in the target's axes
-    by_y, by_x = map(at_places, np.gradient(field, step * target.resolution, axis=(1, 2)))
-    g = at_places(field)
-    observed = at_places(np.stack([target.gradient_x[::step, ::step], target.gradient_y[::step, ::step]]))
-    variance = target.gradient_variance[::step, ::step] + warp(
-        source.gradient_variance, source, target, T, step
+    settled = _core.settle(
+        _gradients_of(source),
+        _gradients_of(target),
+        T_target_source,
+        step=max(1, round(target.parameters.length_scale / PLACES_PER_LENGTH_SCALE / target.resolution)),
+        places=places,
+        steps=steps,
+        tolerance=tolerance * target.parameters.length_scale,
     )
-    weight = 1.0 / at_places(variance[None])
+    return None if settled is None else Refinement(*settled, length_scale=target.parameters.length_scale)
 
-    pivot = ground.mean(axis=0)
-    u, v = (ground - pivot).T
-    # A motion (dx, dy, turn) carries the field along: it falls by its slope along the way, and turns.
-    by_turn = by_y * u - by_x * v - np.stack([-g[1], g[0]])
-    slope_x = np.stack([np.ones_like(u), np.zeros_like(u)])
-    residual = observed - g
-    normalised = residual * np.sqrt(weight)
-    spread = 1.4826 * np.median(np.abs(normalised - np.median(normalised)))
-    return Refinement(
-        T_target_source=T,
-        pivot=pivot,
-        ground=ground,
-        residual=residual,
-        weights=weight / (1.0 + (normalised / (CAUCHY * max(spread, 1e-12))) ** 2),
-        motion=np.stack([by_x, by_y, by_turn, -slope_x, -slope_x[::-1]], axis=-1),
-        strain=np.stack([by_x * u, by_y * v, by_x * v + by_y * u], axis=-1),
-        length_scale=length_scale,
+
+def _gradients_of(gradient_map: GradientMap) -> tuple[Any, ...]:
+    """As the core reads a map."""
+    images = gradient_map.gradient_x, gradient_map.gradient_y, gradient_map.gradient_variance
+    return (
+        *(np.ascontiguousarray(image, dtype=np.float32) for image in images),
+        np.ascontiguousarray(gradient_map.mask, dtype=np.uint8),
+        gradient_map.origin,
+        gradient_map.resolution,
     )

@@ -9,19 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from terrainloop import _core
 from terrainloop.geometry import Array, inverse, se2, transform, yaw_of
 from terrainloop.gradient_map import GradientMap
 from terrainloop.matching.evidence import surprise
-from terrainloop.matching.field import TINY, Field, Image, field_of, turn_field
+from terrainloop.matching.field import Field, Image, field_of, turn_field
 
 PIXELS_PER_LENGTH_SCALE = 2  # a finer field tells no more: the spectrum of the process ends there
 MAX_PIXELS = 96  # across; larger maps are searched at twice the spacing, and so on
 TURN = 1.0  # pixels that ground moves between two rotations, root mean square over the map
-CHUNK = 8  # groups at a time, so that they stay in the cache
 GROUP = 3  # rotations that share the sums of energies, which hardly change by a turn
 MIN_AREA = 20.0  # of shared ground, in squared length scales
 EVIDENT = 6.0  # r^2 in units of its mean, above which a pose is looked at: one in seventy
-ROUNDING = 1e-6  # of the FFT, relative to the largest value
 WRAPPED = 0.8  # of the size at which nothing wraps around
 APART = 1.5  # length scales by which two places differ
 
@@ -44,7 +43,7 @@ class Search:
         For each of K rotations, evenly spaced from 0 to 2 pi, the ground that counts as one
         independent sample, m^2; NaN where no shift shares enough ground.
     tried : float
-        Poses tried: rotations times shifts, these in units of a squared length scale.
+        Poses tried: rotations, in units of `TURN`, times shifts, in units of a squared length scale.
     """
 
     places: list[Array]
@@ -120,37 +119,26 @@ def search(source: SearchMap, target: SearchMap, count: int) -> Search:
     field = target.field(spacing)
     size = _size(source.field(spacing), field)
     with _turning:
-        turned = _turned(source, spacing, size)
-    stored = target.spectra(spacing, size)
+        turned = _turned_spectra(source, spacing, size)
     pixels = (max(source.length_scale, target.length_scale) / spacing) ** 2  # of a squared length scale
-    turns, tried = len(turned.poses), 0.0
-    null = np.full(turns, np.nan)
-
-    def unwrapped(index: NDArray[np.int64], extent: int) -> NDArray[np.int64]:
-        return index - size * (index >= extent)  # shifts back stand at the far end
-
-    evident = [np.empty((4, 0))]  # surprise, rotation, row and column of poses that agree well
-    for start in range(0, turns, CHUNK * GROUP):
-        chunk = slice(start, start + CHUNK * GROUP)
-        shared, energies = _energies(turned.ground[start // GROUP :][:CHUNK], stored, size)
-        enough = shared > MIN_AREA * pixels
-        admissible = np.repeat(np.count_nonzero(enough, axis=(1, 2)), GROUP)
-        scale = np.repeat(enough / np.sqrt(energies), GROUP, axis=0)
-        shared = np.repeat(shared, GROUP, axis=0)
-        r = _products(turned.fields[chunk], stored, size) * scale
-        evidence = r * r * shared
-        sample = np.maximum(evidence.sum(axis=(1, 2)) / np.maximum(admissible, 1), 1.0).astype(np.float32)
-        null[chunk] = np.where(admissible > 0, sample, np.nan)
-        tried += admissible.sum() / pixels
-        at = np.nonzero((evidence > (EVIDENT * sample)[:, None, None]) & (r > 0))
-        surprises = surprise(r[at] ** 2, shared[at] / sample[at[0]])
-        evident.append(np.stack([surprises, at[0] + start, *map(unwrapped, at[1:], field.known.shape)]))
+    evident, sample, admissible = _core.search_correlate(
+        turned.fields,
+        turned.ground,
+        target.spectra(spacing, size).view(np.float32).reshape(4, size, -1, 2),
+        least_shared=MIN_AREA * pixels,
+        evident=EVIDENT,
+    )
+    rotation, row, column, r_squared, samples = evident.T
+    rows, columns = field.known.shape
+    row, column = row - size * (row >= rows), column - size * (column >= columns)  # shifts back are last
+    poses = np.stack([surprise(r_squared, samples), rotation, row, column])
+    turns = len(turned.poses)
     arc = 2 * np.pi * source.radius / spacing / max(turns, 1)
-    poses = np.concatenate(evident, axis=1)
+    tried = admissible.sum() * arc / TURN / pixels
     peaks = _distinct_peaks(poses, APART * np.sqrt(pixels), turns, arc, count)
     metres = field.metres_from_pixels
     places = [metres @ se2(column, row, 0.0) @ turned.poses[int(k)] for _, k, row, column in peaks.T.tolist()]
-    return Search(places, peaks[0], null * spacing**2, tried)
+    return Search(places, peaks[0], sample * spacing**2, float(tried))
 
 
 def same_place(T: Array, other: Array, source: SearchMap) -> bool:
@@ -178,37 +166,31 @@ def _distinct_peaks(poses: Array, apart: float, turns: int, arc: float, count: i
     return poses[:, peaks]
 
 
-def _products(fields: Spectra, stored: Spectra, size: int) -> Image:
-    """Sums of scalar products (K, size, size) at every shift of K rotations."""
-    return np.asarray(fft.irfft2(fields[:, 0] * stored[0] + fields[:, 1] * stored[1], s=(size, size)))
-
-
-def _energies(ground: Spectra, stored: Spectra, size: int) -> tuple[Image, Image]:
-    """Shared pixels and the product of the energies over them (K, size, size), at every shift."""
-    sums = fft.irfft2(ground[:, [0, 0, 1]] * stored[[2, 3, 2]], s=(size, size))
-    shared, energy, other = sums.swapaxes(0, 1)
-    energies = energy * other
-    return shared, np.maximum(energies, ROUNDING * energies.max() + TINY)
-
-
 @dataclass(frozen=True, eq=False)
 class _Turned:
-    """A field at K rotations, about the middle of its ground."""
+    """A field at K rotations, about the middle of its ground: images, or spectra for the core."""
 
     poses: Array  # (K, 3, 3), from metres of the map to pixels
-    fields: Spectra  # (K, 2, size, size // 2 + 1), conjugate: x and y
-    ground: Spectra  # (K / GROUP, 2, size, size // 2 + 1), conjugate: known and energy, midst each group
+    fields: Image  # of every rotation: x and y
+    ground: Image  # of every group of rotations, midst it: known and energy
 
 
-@lru_cache(maxsize=2)
-def _turned(source: SearchMap, spacing: float, size: int) -> _Turned:
+@lru_cache(maxsize=3)  # maps of like extent take few sizes
+def _turned_spectra(source: SearchMap, spacing: float, size: int) -> _Turned:
+    turned = _turned(source, spacing)
+    ground = _core.search_spectra(turned.ground, size)[:, 0]
+    return _Turned(turned.poses, _core.search_spectra(turned.fields, size), ground)
+
+
+@lru_cache(maxsize=1)
+def _turned(source: SearchMap, spacing: float) -> _Turned:
     field = source.field(spacing)
     across = _across(field)
-    per_group = TURN * GROUP * spacing
-    groups = int(np.ceil(2 * np.pi * source.radius / per_group))
+    per_block = TURN * GROUP * _core.LANES * spacing
+    groups = int(np.ceil(2 * np.pi * source.radius / per_block)) * _core.LANES
     poses = np.empty((groups * GROUP, 3, 3))
-    fields = np.empty((len(poses), 2, size, size // 2 + 1), np.complex64)
-    ground = np.empty((groups, 2, size, size // 2 + 1), np.complex64)
+    fields = np.empty((groups, GROUP, 2, across + 1, across + 1), np.float32)
+    ground = np.empty((groups, 1, 2, across + 1, across + 1), np.float32)
     pixels_from_metres = np.asarray(np.linalg.inv(field.metres_from_pixels), dtype=float)
     middle = transform(pixels_from_metres, source.middle)
     centre = np.array([across / 2, across / 2])
@@ -216,10 +198,16 @@ def _turned(source: SearchMap, spacing: float, size: int) -> _Turned:
         turn = se2(0.0, 0.0, 2 * np.pi * k / len(poses))
         turn[:2, 2] = centre - turn[:2, :2] @ middle
         poses[k] = turn @ pixels_from_metres
+        group, turned = divmod(k, GROUP)
+        if group >= groups // 2:  # half a turn later all is upside down
+            continue
         x, y, known = turn_field(field, inverse(turn), (across + 1, across + 1))
-        fields[k] = np.conj(_spectra_of((x, y), size))
-        if k % GROUP == GROUP // 2:
-            ground[k // GROUP] = np.conj(_spectra_of((known, x**2 + y**2), size))
+        fields[group, turned] = x, y
+        if turned == GROUP // 2:
+            ground[group, 0] = known, x**2 + y**2
+    half = groups // 2
+    fields[half:] = -fields[:half, ..., ::-1, ::-1]
+    ground[half:] = ground[:half, ..., ::-1, ::-1]
     return _Turned(poses, fields, ground)
 
 
@@ -233,7 +221,9 @@ def _size(source: Field, target: Field) -> int:
     Shifts at which maps share only a rim wrap around and add to those at the other side: that costs
     nothing but the sight of such rims, and saves a third of the time.
     """
-    return int(fft.next_fast_len(int(WRAPPED * (_across(source) + max(target.known.shape))) + 1, real=True))
+    across, extent = _across(source), max(target.known.shape)
+    least = max(int(WRAPPED * (across + extent)), across, extent) + 1
+    return 2 * int(fft.next_fast_len(-(-least // 2), real=True))  # the core wants it even
 
 
 def _across(field: Field) -> int:
