@@ -374,7 +374,10 @@ def test_a_run_by_inliers_is_scored_over_inliers(ok, run, mission_folder, tmp_pa
         (tmp_path / name).write_bytes((run / name).read_bytes())
     (tmp_path / "config.yaml").write_text("match: {decision: inliers}")
     told = json.loads(ok("evaluate", tmp_path, "--truth", mission_folder / "truth.tum", "--json"))
+    assert told["threshold"] == "inliers"
     assert [point["min_inliers"] for point in told["precision_recall"]] == list(range(1, 21))
+    assert "min_inliers" in rows_of(tmp_path / "precision_recall_curve.csv")[0]
+    assert "inliers >=" in ok("evaluate", tmp_path, "--truth", mission_folder / "truth.tum")
 
 
 def test_evaluate_scores_the_run(ok, run, mission_folder):
@@ -393,6 +396,37 @@ def test_evaluate_scores_the_run(ok, run, mission_folder):
     written = rows_of(run / "precision_recall.csv")
     assert [int(row["true_positives"]) for row in written] == [point["true_positives"] for point in curve]
     assert (run / "precision_recall.png").read_bytes().startswith(b"\x89PNG")
+
+
+RIGHT_BY = ["overlap", "overlap and pose", "pose"]
+
+
+def test_evaluate_tells_the_curve_in_numbers(ok, run, mission_folder):
+    told = json.loads(ok("evaluate", run, "--truth", mission_folder / "truth.tum", "--json"))
+    assert told["threshold"] == "score"
+    assert [(m["truth"], m["right_by"]) for m in told["metrics"]] == [("box", by) for by in RIGHT_BY]
+    for numbers in told["metrics"]:
+        assert (numbers["pairs"], numbers["true_pairs"]) == (4, 1)
+        for name in ("recall_at_full_precision", "max_f1", "average_precision"):
+            assert numbers[name] == {"value": 1.0, "low": 1.0, "high": 1.0}
+    curve = rows_of(run / "precision_recall_curve.csv")
+    assert list(dict.fromkeys(row["right_by"] for row in curve)) == RIGHT_BY
+    best = curve[0]
+    assert (best["precision"], best["recall"], best["false_positives"]) == ("1.0", "1.0", "0")
+    scores = {float(row["score"]) for row in rows_of(run / "pairs.csv")}
+    assert {float(row["min_score"]) for row in curve} <= scores
+
+
+def test_evaluate_by_the_ground_observed(ok, run, mission_folder):
+    arguments = ["evaluate", run, "--truth", mission_folder / "truth.tum", "--clouds", mission_folder]
+    told = json.loads(ok(*arguments, "--json"))
+    keys = [(m["truth"], m["right_by"]) for m in told["metrics"]]
+    assert keys == [(truth, by) for truth in ("box", "observed") for by in RIGHT_BY]
+    assert {m["true_pairs"] for m in told["metrics"]} == {1}
+    text = in_one_line(ok(*arguments))
+    assert "Bounding-box IoU > 0.3: 1 true pair " in text
+    assert "IoU of the observed ground > 0.3: 1 true pair " in text
+    assert "1.00 (1.00-1.00)" in text
 
 
 def test_evaluate_in_words(ok, run, mission_folder):
@@ -542,6 +576,14 @@ def test_evaluate_of_no_run(refused, mission_folder, tmp_path):
 
 def test_evaluate_without_truth(refused, run, tmp_path):
     assert "absent.tum" in refused("evaluate", run, "--truth", tmp_path / "absent.tum")
+
+
+def test_evaluate_with_clouds_of_another_mission(refused, run, mission_folder, tmp_path):
+    (tmp_path / "clouds").mkdir()
+    arguments = ["evaluate", run, "--truth", mission_folder / "truth.tum", "--clouds", tmp_path]
+    assert "clouds" in refused(*arguments)
+    shutil.copy(cloud(mission_folder, "000000"), tmp_path / "clouds")
+    assert "found 1 cloud;" in refused(*arguments)
 
 
 @pytest.mark.parametrize(

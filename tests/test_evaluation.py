@@ -1,13 +1,26 @@
 """Overlap, precision and recall, and the judge, against closed forms, counts by hand and scikit-learn."""
 
+from collections import namedtuple
+from dataclasses import astuple
+
 import numpy as np
 import pytest
-from sklearn.metrics import precision_recall_fscore_support
+from sklearn.metrics import (
+    average_precision_score,
+    f1_score,
+    precision_recall_curve,
+    precision_recall_fscore_support,
+)
 
 from terrainloop.errors import TerrainLoopError
-from terrainloop.evaluation.judge import judge
-from terrainloop.evaluation.overlap import box_iou, world_boxes
-from terrainloop.evaluation.precision_recall import OperatingPoint, precision_recall, recall_at_full_precision
+from terrainloop.evaluation.judge import judge, readings
+from terrainloop.evaluation.overlap import box_iou, ground_cell, observed_iou, world_boxes
+from terrainloop.evaluation.precision_recall import (
+    OperatingPoint,
+    measure,
+    precision_recall,
+    recall_at_full_precision,
+)
 from terrainloop.geometry import inverse, se3
 from terrainloop.io.results import SubmapRecord
 from terrainloop.loop import LoopCandidate
@@ -71,6 +84,54 @@ def test_world_box_of_a_lopsided_hull():
     np.testing.assert_allclose(boxes, [[0, 0, 4, 1], [-1, 0, 0, 4]], rtol=0, atol=1e-12)
 
 
+def ground(*sides, low=(0.0, 0.0), spacing=0.1):
+    """Points in the middle of every square of a rectangle, at a height that must not matter."""
+    x, y = (start + np.arange(spacing / 2, side, spacing) for start, side in zip(low, sides, strict=True))
+    return np.array([(a, b, 3.0 * a) for a in x for b in y])
+
+
+@pytest.mark.parametrize("cell", [0.2, 0.5, 1.0])
+def test_observed_iou_in_closed_form(cell):
+    hook = np.vstack([ground(4, 1), ground(1, 2, low=(0, 1))])  # 6 of the 12 m2 of its box
+    clouds = [ground(4, 3), hook, ground(2, 3, low=(2, 0)), ground(2, 3), np.empty((0, 3))]
+    poses = np.array([np.eye(4)] * 3 + [se3(-6, 0, 0, 0, 0, 0), np.eye(4)])
+    expected = np.zeros((5, 5))
+    expected[np.diag_indices(4)] = 1.0
+    expected[0, 1] = expected[1, 0] = 6 / 12
+    expected[0, 2] = expected[2, 0] = 6 / 12
+    expected[1, 2] = expected[2, 1] = 2 / 10
+    np.testing.assert_allclose(observed_iou(clouds, poses, cell), expected, rtol=0, atol=1e-12)
+
+
+def test_observed_iou_of_posed_clouds_by_sets():
+    rng = np.random.default_rng(0)
+    clouds = [rng.uniform(-4, 4, (300, 3)) for _ in range(6)]
+    poses = np.array([se3(*rng.uniform(-3, 3, 3), *rng.uniform(-0.1, 0.1, 2), 2.0 * i) for i in range(6)])
+    cells = [
+        {tuple(np.floor((pose @ [*p, 1.0])[:2] / 0.7)) for p in cloud}
+        for cloud, pose in zip(clouds, poses, strict=True)
+    ]
+    expected = [[len(a & b) / len(a | b) for b in cells] for a in cells]
+    np.testing.assert_allclose(observed_iou(clouds, poses, 0.7), expected, rtol=0, atol=1e-12)
+
+
+def test_no_clouds():
+    assert observed_iou([], np.empty((0, 4, 4)), 1.0).shape == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("density", "expected"), [(200, 0.25), (60, 0.5), (15, 1.0), (6.6, 2.0), (0.01, 8.0)]
+)
+def test_cell_of_scattered_points(density, expected):
+    """A half leaves a cell empty with chance exp(-density cell^2 / 2); IoU is p / (2 - p), p the rest."""
+    rng = np.random.default_rng(0)
+    clouds = [rng.uniform(0, 32, (int(density * 32**2), 3)) for _ in range(2)]
+    assert ground_cell([*clouds, np.empty((0, 3))]) == expected
+    seen = -np.expm1(-density * np.array([0.25, 0.5, 1, 2, 4, 8.0]) ** 2 / 2)
+    enough = seen / (2 - seen) >= 0.95
+    assert ground_cell(clouds) == (2.0 ** (enough.argmax() - 2) if enough.any() else 8.0)
+
+
 # --- precision and recall
 
 SCORES = [9, 7, 7, 5, 3, 1]
@@ -131,6 +192,115 @@ def test_recall_at_full_precision(positive, negative, expected):
 @pytest.mark.parametrize("negative", [[], [3.0]])
 def test_recall_without_positives_is_no_number(negative):
     assert np.isnan(recall_at_full_precision([], negative))
+
+
+def scored(seed, count=120, levels=25):
+    """Scores with ties that tell something, and truth; pairs of 16 submaps."""
+    rng = np.random.default_rng(seed)
+    is_true = rng.random(count) < 0.3
+    submaps = np.array([rng.choice(16, 2, replace=False) for _ in range(count)])
+    return rng.integers(0, levels, count) + 6.0 * is_true, is_true, submaps
+
+
+@pytest.mark.parametrize("levels", [3, 25, 10**6])
+def test_curve_over_every_score_equals_scikit_learn(levels):
+    scores, is_true, _ = scored(1, levels=levels)
+    points = precision_recall(scores, is_true)
+    precision, recall, thresholds = precision_recall_curve(is_true, scores)
+    assert [p.threshold for p in points] == thresholds[::-1].tolist()
+    assert [p.precision for p in points] == pytest.approx(precision[-2::-1])
+    assert [p.recall for p in points] == pytest.approx(recall[-2::-1])
+
+
+@pytest.mark.parametrize("levels", [3, 25, 10**6])
+def test_metrics_equal_scikit_learn(levels):
+    scores, is_true, submaps = scored(2, levels=levels)
+    metrics = measure(scores, is_true, submaps)
+    assert (metrics.pairs, metrics.true_pairs) == (120, is_true.sum())
+    assert metrics.average_precision.value == pytest.approx(average_precision_score(is_true, scores))
+    assert metrics.max_f1.value == pytest.approx(max(f1_score(is_true, scores >= s) for s in scores))
+    full = recall_at_full_precision(scores[is_true], scores[~is_true])
+    assert metrics.recall_at_full_precision.value == pytest.approx(full)
+
+
+def test_metrics_by_hand():
+    """Thresholds 9, 7, 5, 3, 1: precision 1, 2/3, 3/4, 3/5, 4/6 at recall 1/4, 2/4, 3/4, 3/4, 1."""
+    metrics = measure(SCORES, TRUE, [(0, 9)] * 6)
+    assert metrics.recall_at_full_precision.value == pytest.approx(1 / 4)
+    assert metrics.max_f1.value == pytest.approx(2 * 4 / (6 + 4))
+    assert metrics.average_precision.value == pytest.approx((1 + 2 / 3 + 3 / 4 + 4 / 6) / 4)
+
+
+def test_one_false_match_among_many_ends_full_precision():
+    is_true = np.arange(40) != 30
+    metrics = measure(-np.arange(40), is_true, np.c_[np.arange(40), np.arange(40) + 50])
+    assert metrics.recall_at_full_precision.value == pytest.approx(30 / 39)
+
+
+def test_a_true_pair_matched_wrongly_is_false_and_missed():
+    is_right = [True, True, True, False, False, True]  # the third is no true pair, so its match is not right
+    points = precision_recall(SCORES, TRUE, is_right=is_right)
+    counted = [(p.true_positives, p.false_positives, p.false_negatives) for p in points]
+    assert counted == [(1, 0, 3), (2, 1, 2), (2, 2, 2), (2, 3, 2), (3, 3, 1)]
+    metrics = measure(SCORES, TRUE, [(0, 9)] * 6, is_right)
+    assert metrics.average_precision.value == pytest.approx((1 + 2 / 3 + 3 / 6) / 4)
+    assert metrics.max_f1.value == pytest.approx(2 * 3 / (6 + 4))
+
+
+@pytest.mark.parametrize("nothing", [-np.inf, np.nan])
+def test_pairs_that_nothing_matches_stay_missed(nothing):
+    scores, is_true = [8.0, nothing, 5.0, nothing], [True, True, True, False]
+    metrics = measure(scores, is_true, [(0, 9)] * 4)
+    assert metrics.recall_at_full_precision.value == pytest.approx(2 / 3)
+    assert metrics.average_precision.value == pytest.approx(2 / 3)
+    assert metrics.max_f1.value == pytest.approx(2 * 2 / (2 + 3))
+    assert [p.threshold for p in precision_recall(scores, is_true)] == [8.0, 5.0]
+
+
+def test_intervals_are_those_of_submaps_drawn_again():
+    """Every pair written out as often as its submaps were drawn, measured by scikit-learn."""
+    scores, is_true, submaps = scored(3)
+    rng, averages = np.random.default_rng(0), []
+    for _ in range(1000):
+        times = np.bincount(rng.integers(16, size=16), minlength=16)
+        again = np.repeat(np.arange(len(scores)), times[submaps[:, 0]] * times[submaps[:, 1]])
+        if is_true[again].any():
+            averages.append(average_precision_score(is_true[again], scores[again]))
+    estimate = measure(scores, is_true, submaps).average_precision
+    assert (estimate.low, estimate.high) == pytest.approx(tuple(np.percentile(averages, [2.5, 97.5])))
+    assert estimate.low < estimate.value < estimate.high
+
+
+def test_intervals_are_the_same_again():
+    scores, is_true, submaps = scored(4)
+    names = np.array([f"{n:06d}" for n in range(16)])[submaps]
+    order = np.random.default_rng(0).permutation(len(scores))
+    assert measure(scores, is_true, submaps) == measure(scores[order], is_true[order], names[order])
+
+
+def test_pairs_of_few_submaps_tell_less_than_as_many_of_many():
+    """600 true pairs, of which a third is missed: those of every third source."""
+    widths = []
+    for count in (6, 60):
+        source = np.arange(600) % count
+        scores = np.where(source % 3 == 0, -np.inf, 9.0)
+        f1 = measure(scores, np.ones(600), np.c_[source, source + 100]).max_f1
+        assert f1.value == pytest.approx(2 * 400 / (400 + 600))
+        widths.append(f1.high - f1.low)
+    assert widths[0] > 2 * widths[1]
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_metrics_without_true_pairs_are_no_numbers(count):
+    metrics = measure(np.arange(count), np.zeros(count), np.zeros((count, 2)))
+    assert (metrics.pairs, metrics.true_pairs) == (count, 0)
+    assert np.isnan([astuple(e) for e in (metrics.recall_at_full_precision, metrics.average_precision)]).all()
+
+
+def test_a_method_that_compares_nothing_finds_nothing():
+    metrics = measure([-np.inf] * 3, [True, True, False], [(0, 2), (0, 3), (1, 3)])
+    assert astuple(metrics.average_precision) == astuple(metrics.max_f1) == (0, 0, 0)
+    assert precision_recall([-np.inf] * 3, [True, True, False]) == []
 
 
 # --- the judge
@@ -255,3 +425,60 @@ def test_an_unknown_name_is_an_error():
 def test_a_name_without_session_is_an_error():
     with pytest.raises(TerrainLoopError, match=r"sessions file; found no 'd'"):
         judge([candidate("d", "a", np.eye(4))], RECORDS, POSES, {"a": "1"})
+
+
+Scored = namedtuple("Scored", "source target score T_target_source")
+
+
+def test_any_scored_pair_is_judged():
+    """What a baseline says is judged as a loop candidate is."""
+    T = se3(0.3, 0, 0, 0, 0, 0.01) @ true("d", "a")
+    (theirs,), (ours,) = (
+        judge([pair], RECORDS, POSES) for pair in (Scored("d", "a", 9.0, T), candidate("d", "a", T))
+    )
+    assert theirs.candidate.score == 9.0
+    assert astuple(theirs)[1:] == pytest.approx(astuple(ours)[1:], nan_ok=True)
+
+
+def test_observed_overlap_is_handed_on():
+    observed = np.arange(25.0).reshape(5, 5) / 25
+    pairs = [candidate("d", "a", true("d", "a")), candidate("e", "b", true("e", "b"))]
+    assert [p.observed_overlap for p in judge(pairs, RECORDS, POSES, None, observed)] == [15 / 25, 21 / 25]
+    assert np.isnan([p.observed_overlap for p in judge(pairs, RECORDS, POSES)]).all()
+
+
+def test_readings_of_right_and_wrong():
+    """Five pairs: true and right, true and wrong, little shared and right, little and wrong, nothing."""
+    poses = POSES.copy()
+    poses[4] = se3(1.5, 0.0, 0.0, 0.0, 0.0, 0.0)  # e shares 1/7 with a
+    right, wrong = np.eye(4), se3(5, 0, 0, 0, 0, 0)
+    pairs = [
+        Scored("d", "a", 5.0, right @ true("d", "a")),
+        Scored("d", "a", 4.0, wrong),
+        Scored("e", "a", 3.0, inverse(poses[0]) @ poses[4]),
+        Scored("e", "a", 2.0, wrong),
+        Scored("e", "b", 1.0, wrong),
+    ]
+    observed = np.zeros((5, 5))
+    observed[4, 0] = 0.5
+    judged = judge(pairs, RECORDS, poses, None, observed)
+
+    def counted(read):
+        return [(p.threshold, p.true_positives, p.false_positives, p.false_negatives) for p in read.curve()]
+
+    by = readings(judged, 0.3)
+    assert list(by) == ["overlap", "overlap and pose", "pose"]
+    assert counted(by["overlap"]) == [(5, 1, 0, 1), (4, 2, 0, 0), (3, 2, 1, 0), (2, 2, 2, 0), (1, 2, 3, 0)]
+    assert counted(by["overlap and pose"]) == [
+        *[(5, 1, 0, 1), (4, 1, 1, 1), (3, 1, 2, 1), (2, 1, 3, 1), (1, 1, 4, 1)]
+    ]
+    assert counted(by["pose"]) == [(5, 1, 0, 1), (4, 1, 1, 1), (2, 1, 2, 1), (1, 1, 3, 1)]
+    assert by["pose"].metrics().recall_at_full_precision.value == 0.5
+    seen = readings(judged, 0.3, observed=True, scores=[1, 2, 3, 4, 5])
+    assert counted(seen["overlap"]) == [(5, 0, 1, 2), (4, 1, 1, 1), (3, 2, 1, 0), (2, 2, 2, 0), (1, 2, 3, 0)]
+
+
+def test_readings_of_no_pairs():
+    for reading in readings([], 0.3).values():
+        assert reading.curve() == []
+        assert reading.metrics().pairs == 0

@@ -197,5 +197,19 @@ CURVE = [OperatingPoint(float(n), 10 - n // 2, max(0, 8 - n), n // 2) for n in r
     ids=["curve", "one point", "no pairs", "nothing found"],
 )
 def test_precision_recall(points, tmp_path):
-    picture = pictures(lambda: figure_precision_recall(points, "IoU > 0.3", "least score"), tmp_path)
-    assert drawn_share(picture) > 0.005
+    def draw():
+        return figure_precision_recall(points, "IoU > 0.3", "least score", {"by pose": points[::-1]})
+
+    assert drawn_share(pictures(draw, tmp_path)) > 0.005
+
+
+def test_curves_of_precision_and_recall_are_drawn_in_steps(tmp_path):
+    """The area beneath a curve is its average precision."""
+    steps = [OperatingPoint(9.0, 1, 0, 1), OperatingPoint(5.0, 1, 3, 1), OperatingPoint(4.0, 2, 3, 0)]
+    figure = figure_precision_recall(steps[:1], "IoU > 0.3", "least score", {"a": steps, "none": []})
+    line, empty, dots = figure.axes[0].get_lines()
+    assert line.get_drawstyle() == "steps-pre"
+    recall, precision = line.get_xdata(), line.get_ydata()
+    assert np.diff(recall) @ precision[1:] == pytest.approx((1 + 2 / 5) / 2)
+    assert len(empty.get_xdata()) == 0
+    assert (dots.get_xdata(), dots.get_ydata()) == ([0.5], [1.0])

@@ -1,7 +1,8 @@
 """``terrainloop evaluate``: precision and recall against the truth."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,15 +10,23 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose, table_of
+from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose, count_of, table_of
 from terrainloop.errors import TerrainLoopError
 
 if TYPE_CHECKING:
-    from terrainloop.evaluation.judge import JudgedPair
-    from terrainloop.evaluation.precision_recall import OperatingPoint
+    from terrainloop.config import MatchSettings
+    from terrainloop.evaluation.judge import JudgedPair, Reading
+    from terrainloop.evaluation.precision_recall import Metrics, OperatingPoint
+    from terrainloop.geometry import Array
+    from terrainloop.io.results import SubmapRecord
+    from terrainloop.loop import LoopCandidate
+
+    Judged = JudgedPair[LoopCandidate]
 
 INLIER_THRESHOLDS: Sequence[int] = tuple(range(1, 21))  # the paper's
 SCORE_THRESHOLDS: Sequence[int] = (0, 1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 50)
+_COUNTS = ("precision", "recall", "true_positives", "false_positives", "false_negatives")
+TRUTHS = {"box": "Bounding-box IoU", "observed": "IoU of the observed ground"}
 
 
 def command(
@@ -36,6 +45,10 @@ def command(
         Path | None,
         typer.Option("--sessions", help="CSV 'cloud,session': leave out pairs of one session."),
     ] = None,
+    clouds: Annotated[
+        Path | None,
+        typer.Option("--clouds", help="Mission folder: judge by the ground that the clouds show, too."),
+    ] = None,
     as_json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -46,37 +59,48 @@ def command(
     every other pair.
     """
     from terrainloop.config import Settings
-    from terrainloop.evaluation.judge import judge
+    from terrainloop.evaluation.judge import judge, readings
     from terrainloop.evaluation.precision_recall import precision_recall
     from terrainloop.io.results import read_loops, read_submaps
     from terrainloop.io.trajectories import read_trajectory
-    from terrainloop.report.figures import figure_precision_recall, save_figure
 
     terminal = Terminal.open(as_json, quiet, verbose)
+    candidates, records = read_loops(run / "pairs.csv"), read_submaps(run / "submaps.csv")
+    poses = read_trajectory(truth).poses
     pairs = judge(
-        read_loops(run / "pairs.csv"),
-        read_submaps(run / "submaps.csv"),
-        read_trajectory(truth).poses,
+        candidates,
+        records,
+        poses,
         _read_sessions(sessions) if sessions else None,
+        _observed(clouds, records, poses) if clouds else None,
     )
-    match = Settings.from_yaml(run / "config.yaml").match
-    if match.decision == "evidence":
-        name, thresholds, values = "score", SCORE_THRESHOLDS, [pair.candidate.score for pair in pairs]
-    else:  # Algorithm 1 returns the inliers of an acceptable transform only
-        name, thresholds = "inliers", INLIER_THRESHOLDS
-        fit = [pair.candidate.ssd_ratio <= match.max_ssd_ratio for pair in pairs]
-        values = [pair.candidate.inliers * fits for pair, fits in zip(pairs, fit, strict=True)]
+    name, thresholds, values = _scores(pairs, Settings.from_yaml(run / "config.yaml").match)
     points = precision_recall(values, [pair.overlap > min_overlap for pair in pairs], thresholds)
     by_pose = precision_recall(values, [pair.pose_is_right for pair in pairs], thresholds)
     rows = [_row(name, point, posed.precision) for point, posed in zip(points, by_pose, strict=True)]
-    figure = figure_precision_recall(points, f"true match: IoU > {min_overlap:g}", f"least {name}")
-    save_figure(figure, run / "precision_recall.png")
-    _write_rows(run / "precision_recall.csv", rows)
-    summary = summarise(pairs, min_overlap) | {"precision_recall": rows}
-    terminal.result(summary, lambda console: show(console, summary))
+    _write_rows(run / "precision_recall.csv", list(rows[0]), [list(row.values()) for row in rows])
+    read = {
+        (kind, right_by): reading
+        for kind in (TRUTHS if clouds else ["box"])
+        for right_by, reading in readings(pairs, min_overlap, kind == "observed", values).items()
+    }
+    _write_rows(
+        run / "precision_recall_curve.csv", ["truth", "right_by", f"min_{name}", *_COUNTS], _curve_rows(read)
+    )
+    metrics = {key: reading.metrics() for key, reading in read.items()}
+    _draw(run / "precision_recall.png", points, read, metrics, f"true match: IoU > {min_overlap:g}", name)
+    summary = summarise(pairs, min_overlap) | {
+        "threshold": name,
+        "metrics": [
+            {"truth": kind, "right_by": right_by, **asdict(numbers)}
+            for (kind, right_by), numbers in metrics.items()
+        ],
+        "precision_recall": rows,
+    }
+    terminal.result(summary, lambda console: show(console, summary, metrics))
 
 
-def summarise(pairs: Sequence["JudgedPair"], min_overlap: float) -> dict[str, Any]:
+def summarise(pairs: Sequence["Judged"], min_overlap: float) -> dict[str, Any]:
     """What the command reports beside the curve."""
     from terrainloop.evaluation.precision_recall import recall_at_full_precision
 
@@ -107,11 +131,12 @@ def summarise(pairs: Sequence["JudgedPair"], min_overlap: float) -> dict[str, An
     }
 
 
-def show(console: Console, summary: dict[str, Any]) -> None:
-    """The summary and the curve, as text."""
+def show(console: Console, summary: dict[str, Any], metrics: Mapping[tuple[str, str], "Metrics"]) -> None:
+    """The summary, the curve and its numbers, as text."""
+    name = summary["threshold"]
     rows = [
         [
-            f"{next(iter(row.values())):g}",
+            f"{row[f'min_{name}']:g}",
             f"{row['precision']:.3f}",
             f"{row['recall']:.3f}",
             str(row["true_positives"]),
@@ -122,9 +147,9 @@ def show(console: Console, summary: dict[str, Any]) -> None:
         for row in summary["precision_recall"]
     ]
     title = f"True match: bounding-box IoU > {summary['min_overlap']:g}"
-    threshold = next(iter(summary["precision_recall"][0])).removeprefix("min_")
-    heads = [f"{threshold} >=", "precision", "recall", "TP", "FP", "FN", "right pose"]
+    heads = [f"{name} >=", "precision", "recall", "TP", "FP", "FN", "right pose"]
     console.print(table_of(title, heads, rows))
+    _show_metrics(console, metrics, summary["min_overlap"])
     console.print(
         f"\n{summary['pairs']} pairs scored, {summary['true_pairs']} of them true. "
         f"Accepted: {summary['accepted_true']} true, {summary['accepted_less_overlap']} that share less, "
@@ -144,23 +169,95 @@ def show(console: Console, summary: dict[str, Any]) -> None:
             )
 
 
-def _row(name: str, point: "OperatingPoint", pose_precision: float) -> dict[str, float]:
-    return {
-        f"min_{name}": int(point.threshold),
-        "precision": point.precision,
-        "recall": point.recall,
-        "true_positives": point.true_positives,
-        "false_positives": point.false_positives,
-        "false_negatives": point.false_negatives,
-        "pose_precision": pose_precision,
+def _show_metrics(console: Console, metrics: Mapping[tuple[str, str], "Metrics"], min_overlap: float) -> None:
+    heads = ["right by", "recall at P = 1", "max F1", "average P"]
+    for kind, what in TRUTHS.items():
+        rows = [
+            [
+                right_by,
+                str(numbers.recall_at_full_precision),
+                str(numbers.max_f1),
+                str(numbers.average_precision),
+            ]
+            for (of, right_by), numbers in metrics.items()
+            if of == kind
+        ]
+        if rows:
+            count = count_of(metrics[kind, "overlap"].true_pairs, "true pair")
+            console.print()
+            console.print(table_of(f"{what} > {min_overlap:g}: {count}", heads, rows))
+    console.print(
+        "\nIn brackets: 95 % of the bootstrap. By overlap (the paper), pairs that share less are false "
+        "even if their pose is right; by pose, such pairs do not count."
+    )
+
+
+def _scores(pairs: Sequence["Judged"], match: "MatchSettings") -> tuple[str, Sequence[int], list[float]]:
+    """What is thresholded, at what, and its value for each pair; -inf for those without a transform."""
+    if match.decision == "evidence":
+        comparable = [bool(np.isfinite(pair.candidate.T_target_source).all()) for pair in pairs]
+        values = [pair.candidate.score for pair in pairs]
+        name, thresholds = "score", SCORE_THRESHOLDS
+    else:  # Algorithm 1 returns the inliers of an acceptable transform only
+        comparable = [pair.candidate.ssd_ratio <= match.max_ssd_ratio for pair in pairs]
+        values = [float(pair.candidate.inliers) for pair in pairs]
+        name, thresholds = "inliers", INLIER_THRESHOLDS
+    found = [value if able else -np.inf for value, able in zip(values, comparable, strict=True)]
+    return name, thresholds, found
+
+
+def _observed(folder: Path, records: Sequence["SubmapRecord"], poses: "Array") -> "Array":
+    """IoU of the ground that the clouds of a mission observed; broken ones share nothing."""
+    from terrainloop.evaluation.overlap import ground_cell, observed_iou
+    from terrainloop.io.missions import load_mission
+
+    mission = load_mission(folder)
+    if mission.names != tuple(record.name for record in records):
+        raise TerrainLoopError(
+            expected=f"the {len(records)} clouds of the run in {folder}",
+            found=count_of(len(mission), "cloud") if len(mission) != len(records) else "other names",
+            mend="give the mission that was detected on",
+        )
+    whole = [record.status == "ok" for record in records]
+    clouds = [mission.read(i).points if ok else np.empty((0, 3)) for i, ok in enumerate(whole)]
+    return observed_iou(clouds, poses, ground_cell(clouds))
+
+
+def _draw(
+    path: Path,
+    points: Sequence["OperatingPoint"],
+    read: Mapping[tuple[str, str], "Reading"],
+    metrics: Mapping[tuple[str, str], "Metrics"],
+    title: str,
+    name: str,
+) -> None:
+    """The curves by bounding boxes; the fixed thresholds marked on the paper's."""
+    from terrainloop.report.figures import figure_precision_recall, save_figure
+
+    curves = {
+        f"right by {right_by}: AP {metrics[kind, right_by].average_precision}": reading.curve()
+        for (kind, right_by), reading in read.items()
+        if kind == "box"
     }
+    save_figure(figure_precision_recall(points, title, f"least {name}", curves), path)
 
 
-def _write_rows(path: Path, rows: Sequence[dict[str, float]]) -> None:
+def _curve_rows(read: Mapping[tuple[str, str], "Reading"]) -> list[list[Any]]:
+    return [
+        [*key, point.threshold, *(getattr(point, count) for count in _COUNTS)]
+        for key, reading in read.items()
+        for point in reading.curve()
+    ]
+
+
+def _row(name: str, point: "OperatingPoint", pose_precision: float) -> dict[str, float]:
+    counts = {count: getattr(point, count) for count in _COUNTS}
+    return {f"min_{name}": int(point.threshold), **counts, "pose_precision": pose_precision}
+
+
+def _write_rows(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+        csv.writer(file).writerows([columns, *rows])
 
 
 def _read_sessions(path: Path) -> dict[str, str]:

@@ -1,6 +1,7 @@
 """The paper's pictures: a gradient map in the making, two maps matched, precision and recall."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -121,16 +122,38 @@ def figure_mission(
     return figure
 
 
-def figure_precision_recall(points: Sequence[OperatingPoint], title: str, threshold: str) -> Figure:
-    """Precision against recall, and both against the threshold, named so (paper, Figs. 8 and 9)."""
+def figure_precision_recall(
+    points: Sequence[OperatingPoint],
+    title: str,
+    threshold: str,
+    curves: Mapping[str, Sequence[OperatingPoint]],
+) -> Figure:
+    """Precision against recall, and both against the threshold, named so (paper, Figs. 8 and 9).
+
+    Parameters
+    ----------
+    points : sequence of OperatingPoint
+        At a few thresholds, told beside them.
+    title, threshold : str
+    curves : mapping of str to sequence of OperatingPoint
+        Each by its name, at every distinct score from high to low; drawn in steps, so that the area
+        beneath is the average precision.
+    """
     figure = Figure(figsize=(10, 4.5), layout="constrained")
     curve, by_threshold = figure.subplots(1, 2)
     recall, precision = [p.recall for p in points], [p.precision for p in points]
     thresholds = [p.threshold for p in points]
-    curve.plot(recall, precision, "o-", color=TARGET_COLOUR, markersize=4)
+    looks = cycle([(TARGET_COLOUR, 4.0), (SOURCE_COLOUR, 2.2), ("0.1", 0.9)])  # thinner over thicker
+    for (name, steps), (colour, width) in zip(curves.items(), looks, strict=False):
+        start = [(0.0, p.precision) for p in steps[:1]]
+        drawn = np.array([*start, *((p.recall, p.precision) for p in steps)]).reshape(-1, 2)
+        curve.plot(*drawn.T, color=colour, linewidth=width, drawstyle="steps-pre", label=name)
+    curve.plot(recall, precision, "o", color=TARGET_COLOUR, markersize=4)
     for point in points:
         curve.annotate(f"{point.threshold:g}", (point.recall, point.precision), fontsize=7)
     curve.set(xlabel="recall", ylabel="precision", title=title)
+    if curves:
+        curve.legend(loc="lower left", fontsize=7)
     by_threshold.plot(thresholds, precision, "o-", color=TARGET_COLOUR, markersize=4, label="precision")
     by_threshold.plot(thresholds, recall, "s--", color=SOURCE_COLOUR, markersize=4, label="recall")
     by_threshold.set(xlabel=threshold, title="over the threshold")
