@@ -113,6 +113,8 @@ class SimulatedMission:
         The ground.
     legs : tuple of str
         For each submap "first", "turn", "opposite" or "same", as driven at its middle.
+    frames : array, (M, F, 4, 4)
+        T_world_body: where the rover really was at each frame of each submap.
     """
 
     world: str
@@ -123,6 +125,7 @@ class SimulatedMission:
     truth: Array
     terrain: Terrain
     legs: tuple[str, ...]
+    frames: Array
 
 
 def simulate_mission(
@@ -177,7 +180,10 @@ def simulate_mission(
                 progress(i + 1, submaps)
     middles = range(setup.frames // 2, len(true), setup.frames)
     legs = tuple(path.legs[i] for i in middles)
-    return SimulatedMission(world, seed, sensor, clouds, frames.odometry, frames.truth, terrain, legs)
+    seen_from = true.reshape(submaps, setup.frames, 4, 4)
+    return SimulatedMission(
+        world, seed, sensor, clouds, frames.odometry, frames.truth, terrain, legs, seen_from
+    )
 
 
 def _checked_setup(sensor: str, submaps: int, seed: int) -> Setup:
