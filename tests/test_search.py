@@ -91,7 +91,7 @@ def test_search_is_the_naive_loop(world, ground):
     null, tried, best = naive(source, target, len(found.null_area))
     ratio = found.null_area / null
     assert len(ratio) >= 12
-    assert np.median(ratio) == pytest.approx(1.0, abs=0.06)
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.1)
     assert ratio.min() > 0.75
     assert ratio.max() < 1.35
     turns = 2 * np.pi * source.radius / source.spacing  # that move the ground by a pixel

@@ -15,37 +15,38 @@ namespace terrainloop {
 namespace {
 
 auto search_spectra(const Floats& images, int size) {
-  if (images.ndim() != 5 || images.shape(0) % search::kLanes != 0 || images.shape(2) != 2 ||
-      images.shape(3) != images.shape(4) || images.shape(3) > static_cast<std::size_t>(size))
-    throw nb::value_error("images must be (groups, turns, 2, n, n), groups in LANES, n no more than size");
-  const std::size_t blocks = images.shape(0) / search::kLanes, turns = images.shape(1);
+  if (images.ndim() != 4 || images.shape(0) % search::kLanes != 0 || images.shape(1) != 2 ||
+      images.shape(2) != images.shape(3) || images.shape(2) > static_cast<std::size_t>(size))
+    throw nb::value_error("images must be (K, 2, n, n), K a multiple of LANES, n no more than size");
+  const std::size_t blocks = images.shape(0) / search::kLanes, side = size;
   std::vector<float> spectra;
   {
     nb::gil_scoped_release release;
-    spectra = search::conjugate_spectra(images.data(), static_cast<int>(blocks), static_cast<int>(turns),
-                                        static_cast<int>(images.shape(3)), size);
+    spectra = search::conjugate_spectra(images.data(), static_cast<int>(blocks),
+                                        static_cast<int>(images.shape(2)), size);
   }
-  const std::size_t side = size;
-  return to_numpy(std::move(spectra), {blocks, turns, 2, side, side / 2 + 1, 2, search::kLanes});
+  return to_numpy(std::move(spectra), {blocks, 2, side, side / 2 + 1, 2, search::kLanes});
 }
 
-nb::tuple search_correlate(const Floats& fields, const Floats& ground, const Floats& stored,
-                           double least_shared, double evident) {
+nb::tuple search_correlate(const Floats& fields, const Floats& ground, const Floats& stored_field,
+                           const Floats& stored_ground, double least_shared, double evident) {
   const auto has_shape = [](const Floats& array, const std::vector<std::size_t>& shape) {
     return array.ndim() == shape.size() && std::equal(shape.begin(), shape.end(), array.shape_ptr());
   };
-  if (fields.ndim() != 7) throw nb::value_error("fields must be (blocks, turns, 2, size, waves, 2, LANES)");
-  const std::size_t blocks = fields.shape(0), turns = fields.shape(1), size = fields.shape(3);
-  const std::size_t waves = size / 2 + 1, lanes = search::kLanes;
-  if (!has_shape(fields, {blocks, turns, 2, size, waves, 2, lanes}) ||
-      !has_shape(ground, {blocks, 2, size, waves, 2, lanes}) || !has_shape(stored, {4, size, waves, 2}))
-    throw nb::value_error("fields, ground and stored must be of one size");
+  if (fields.ndim() != 6) throw nb::value_error("fields must be (blocks, 2, size, waves, 2, LANES)");
+  const std::size_t blocks = fields.shape(0), size = fields.shape(2), half = size / 2;
+  const std::size_t lanes = search::kLanes;
+  if (!has_shape(fields, {blocks, 2, size, size / 2 + 1, 2, lanes}) ||
+      !has_shape(ground, {blocks, 2, half, half / 2 + 1, 2, lanes}) ||
+      !has_shape(stored_field, {2, size, size / 2 + 1, 2}) ||
+      !has_shape(stored_ground, {2, half, half / 2 + 1, 2}))
+    throw nb::value_error("fields must be of one size, grounds of half of it");
   search::Correlations found;
   {
     nb::gil_scoped_release release;
-    const search::TurnedSpectra source{fields.data(), ground.data(), static_cast<int>(blocks),
-                                       static_cast<int>(turns)};
-    found = search::correlate(source, stored.data(), static_cast<int>(size), least_shared, evident);
+    const search::TurnedSpectra source{fields.data(), ground.data(), static_cast<int>(blocks)};
+    const search::StoredSpectra stored{stored_field.data(), stored_ground.data()};
+    found = search::correlate(source, stored, static_cast<int>(size), least_shared, evident);
   }
   std::vector<double> poses;
   for (const search::Pose& p : found.evident)
@@ -141,8 +142,8 @@ nb::object settle(const GradientArrays& source, const GradientArrays& target, co
 void bind_matching(nb::module_& module) {
   module.attr("LANES") = search::kLanes;
   module.def("search_spectra", &search_spectra, "images"_a, "size"_a);
-  module.def("search_correlate", &search_correlate, "fields"_a, "ground"_a, "stored"_a, nb::kw_only(),
-             "least_shared"_a, "evident"_a);
+  module.def("search_correlate", &search_correlate, "fields"_a, "ground"_a, "stored_field"_a,
+             "stored_ground"_a, nb::kw_only(), "least_shared"_a, "evident"_a);
   module.def("turn_field", &turn, "x"_a, "y"_a, "known"_a, "affine"_a, nb::kw_only(), "rows"_a, "cols"_a);
   module.def("inlier_counts", &inlier_counts, "source"_a, "target"_a, "motions"_a, "radius"_a);
   module.def("settle", &settle, "source"_a, "target"_a, "T_target_source"_a, nb::kw_only(), "step"_a,

@@ -97,59 +97,65 @@ std::vector<float> half_spectra(const std::vector<float>& images, int extent, in
   return spectra;
 }
 
-TEST(Correlate, IsTheNaiveLoop) {
-  constexpr int extent = 9, size = 16, n = extent * extent, turns = 2;
-  const double least = 12.5, evident = 2;
-  std::vector<float> fields, ground;
-  for (int group = 0; group < kLanes; ++group) {
-    std::vector<float> known(n);
-    for (int i = 0; i < n; ++i) known[i] = (i + group) % 7 ? 1.0f : 0.0f;
-    for (int turn = 0; turn < turns; ++turn) {
-      std::vector<float> field = noise(2 * n, 10 * group + turn);
-      for (int i = 0; i < 2 * n; ++i) field[i] *= known[i % n];
-      fields.insert(fields.end(), field.begin(), field.end());
-      if (turn == 0) {
-        ground.insert(ground.end(), known.begin(), known.end());
-        for (int i = 0; i < n; ++i) ground.push_back(field[i] * field[i] + field[n + i] * field[n + i]);
-      }
-    }
+/// Images (K, extent, extent) summed over 2 x 2 pixels.
+std::vector<float> coarser(const std::vector<float>& images, int extent) {
+  const int half = extent / 2;
+  std::vector<float> sums(images.size() / 4);
+  for (std::size_t i = 0; i < images.size(); ++i) {
+    const std::size_t image = i / (extent * extent), row = i / extent % extent, col = i % extent;
+    sums[(image * half + row / 2) * half + col / 2] += images[i];
   }
-  std::vector<float> stored = noise(2 * n, 99);
-  for (int i = 0; i < n; ++i) stored.push_back(1.0f);
-  for (int i = 0; i < n; ++i) stored.push_back(stored[i] * stored[i] + stored[n + i] * stored[n + i]);
+  return sums;
+}
 
-  const std::vector<float> field_spectra = search::conjugate_spectra(fields.data(), 1, turns, extent, size);
-  const std::vector<float> ground_spectra = search::conjugate_spectra(ground.data(), 1, 1, extent, size);
+TEST(Correlate, IsTheNaiveLoop) {
+  constexpr int extent = 16, size = 24, n = extent * extent;
+  const double least = 40, evident = 2;
+  std::vector<float> fields, ground;
+  for (int rotation = 0; rotation < kLanes; ++rotation) {
+    std::vector<float> field = noise(2 * n, 10 + rotation), known(n);
+    for (int i = 0; i < n; ++i) known[i] = i / extent + i % extent > rotation ? 1.0f : 0.0f;
+    for (int i = 0; i < 2 * n; ++i) field[i] *= known[i % n];
+    fields.insert(fields.end(), field.begin(), field.end());
+    ground.insert(ground.end(), known.begin(), known.end());
+    for (int i = 0; i < n; ++i) ground.push_back(field[i] * field[i] + field[n + i] * field[n + i]);
+  }
+  const std::vector<float> stored = noise(2 * n, 99);
+  std::vector<float> stored_ground(n, 1.0f);
+  for (int i = 0; i < n; ++i) stored_ground.push_back(stored[i] * stored[i] + stored[n + i] * stored[n + i]);
+
+  const std::vector<float> field_spectra = search::conjugate_spectra(fields.data(), 1, extent, size);
+  const std::vector<float> ground_spectra =
+      search::conjugate_spectra(coarser(ground, extent).data(), 1, extent / 2, size / 2);
   const std::vector<float> stored_spectra = half_spectra(stored, extent, size);
-  const search::Correlations found = search::correlate(
-      {field_spectra.data(), ground_spectra.data(), 1, turns}, stored_spectra.data(), size, least, evident);
+  const std::vector<float> coarse_spectra =
+      half_spectra(coarser(stored_ground, extent), extent / 2, size / 2);
+  const search::Correlations found =
+      search::correlate({field_spectra.data(), ground_spectra.data(), 1},
+                        {stored_spectra.data(), coarse_spectra.data()}, size, least, evident);
   std::size_t peaks = 0;
-  for (int group = 0; group < kLanes; ++group) {  // its first turn is the one that its ground was taken from
-    const float *field = &fields[group * turns * 2 * n], *known = &ground[group * 2 * n];
-    const Naive naive(field, stored.data(), known, &stored[2 * n], extent, size, least);
+  for (int rotation = 0; rotation < kLanes; ++rotation) {
+    const Naive naive(&fields[rotation * 2 * n], stored.data(), &ground[rotation * 2 * n],
+                      stored_ground.data(), extent, size, least);
     double sum = 0, count = 0;
     for (int i = 0; i < size * size; ++i) {
       sum += std::abs(naive.agreement[i]);
       count += naive.shared[i] > least;
     }
-    const int rotation = group * turns;
+    // Shared ground and energies are interpolated: exact where they are linear, here all but at the rims.
     const double sample = std::max(sum / count, 1.0);
-    EXPECT_EQ(found.admissible[rotation], count);
-    EXPECT_NEAR(found.sample[rotation], sample, 1e-4 * sample);
+    EXPECT_NEAR(found.admissible[rotation], count, 0.1 * count);
+    EXPECT_NEAR(found.sample[rotation], sample, 0.05 * sample);
     for (const search::Pose& pose : found.evident) {
       if (pose.rotation != rotation) continue;
       ++peaks;
       const int at = pose.row * size + pose.column;
-      EXPECT_GT(naive.agreement[at], evident * sample * (1 - 1e-4));
-      EXPECT_NEAR(pose.squared_correlation, naive.agreement[at] / naive.shared[at], 1e-5);
-      EXPECT_NEAR(pose.samples, naive.shared[at] / sample, 1e-3);
-      for (const int down : {size - 1, 0, 1})
-        for (const int right : {size - 1, 0, 1})
-          EXPECT_LE(naive.agreement[(pose.row + down) % size * size + (pose.column + right) % size],
-                    naive.agreement[at] + 1e-5);
+      const double squared = naive.agreement[at] / naive.shared[at];
+      EXPECT_NEAR(pose.squared_correlation, squared, 0.3 * squared);
+      EXPECT_NEAR(pose.samples, naive.shared[at] / sample, 0.1 * naive.shared[at] / sample);
     }
   }
-  EXPECT_GT(peaks, 10u);
+  EXPECT_GT(peaks, 20u);
 }
 
 TEST(TurnField, TurnsVectorsAlong) {

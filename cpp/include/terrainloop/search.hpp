@@ -5,22 +5,28 @@
 
 namespace terrainloop::search {
 
-/// Groups of rotations that are transformed side by side, one a lane.
+/// Rotations that are tried side by side, one a lane.
 constexpr int kLanes = 8;
 
-/// Spectra of a turned field, as `correlate` reads them. Rotation (block * kLanes + lane) * turns + turn
-/// stands at lane `lane` of fields[block][turn]; a group of `turns` rotations shares one ground. Conjugate;
-/// half spectra (size x (size / 2 + 1)), the real lanes of a wave before the imaginary ones.
+/// Spectra of a turned field, as `correlate` reads them: those of rotation block * kLanes + lane at that
+/// lane. Conjugate half spectra (n x (n / 2 + 1)), the real lanes of a wave before the imaginary ones; n is
+/// the size of the search for the fields, and half of it for the ground, which is summed over 2 x 2 pixels.
 struct TurnedSpectra {
-  const float* fields;  ///< [blocks][turns][x, y][size][size / 2 + 1][re, im][kLanes]
-  const float* ground;  ///< [blocks][known, energy][size][size / 2 + 1][re, im][kLanes]
-  int blocks, turns;
+  const float* fields;  ///< [blocks][x, y][n][n / 2 + 1][re, im][kLanes]
+  const float* ground;  ///< [blocks][known, energy][n][n / 2 + 1][re, im][kLanes]
+  int blocks;
 };
 
-/// Conjugate half spectra of square real images, zero beyond their extent, in the order that TurnedSpectra
-/// has: from [blocks * kLanes][turns][2][extent][extent] to [blocks][turns][2][size][size / 2 + 1][re,
+/// Half spectra of the field that is stored, interleaved complex, of the same sizes.
+struct StoredSpectra {
+  const float* field;   ///< [x, y][n][n / 2 + 1][re, im]
+  const float* ground;  ///< [known, energy][n][n / 2 + 1][re, im]
+};
+
+/// Conjugate half spectra of pairs of square real images, zero beyond their extent, in the order of
+/// TurnedSpectra: from [blocks * kLanes][2][extent][extent] to [blocks][2][size][size / 2 + 1][re,
 /// im][kLanes].
-std::vector<float> conjugate_spectra(const float* images, int blocks, int turns, int extent, int size);
+std::vector<float> conjugate_spectra(const float* images, int blocks, int extent, int size);
 
 struct Pose {
   int rotation, row, column;
@@ -37,11 +43,11 @@ struct Correlations {
 
 /// Correlation of two fields at every rotation and at every (cyclic) shift that shares enough ground.
 ///
-/// `stored` holds the half spectra of the target, interleaved complex: x, y, known ground, energy. The mean
-/// of r^2 times the shared pixels over a rotation is the size of one independent sample; a pose is evident
-/// where r > 0 and r^2 exceeds `evident` times what that gives. `size` must be even, with no factors but 2,
-/// 3, 5.
-Correlations correlate(const TurnedSpectra& source, const float* stored, int size, double least_shared,
-                       double evident);
+/// The mean of r^2 times the shared pixels over a rotation is the size of one independent sample; a pose is
+/// evident where r > 0 and r^2 exceeds `evident` times what that gives. Shared ground and energies, which are
+/// smooth over the shifts, are interpolated from every second one. `size` must be a multiple of 4, with no
+/// factors but 2, 3, 5.
+Correlations correlate(const TurnedSpectra& source, const StoredSpectra& stored, int size,
+                       double least_shared, double evident);
 
 }  // namespace terrainloop::search

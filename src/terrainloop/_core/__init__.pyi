@@ -85,19 +85,20 @@ def gp_block_likelihood(
     """
 
 LANES: int
-"""Groups of rotations that the search treats side by side."""
+"""Rotations that the search tries side by side."""
 
 def search_spectra(images: NDArray[np.float32], size: int) -> NDArray[np.float32]:
-    """Conjugate half spectra of pairs of images (groups, turns, 2, n, n), zero beyond n, for the search.
+    """Conjugate half spectra of pairs of images (K, 2, n, n), zero beyond n, for the search.
 
-    They are (groups / LANES, turns, 2, size, size / 2 + 1, 2, LANES): real and imaginary parts, then the
-    groups side by side. The size is even, with no prime factors but 2, 3 and 5.
+    They are (K / LANES, 2, size, size / 2 + 1, 2, LANES): real and imaginary parts, then the rotations side by
+    side. The size is even, with no prime factors but 2, 3 and 5.
     """
 
 def search_correlate(
     fields: NDArray[np.float32],
     ground: NDArray[np.float32],
-    stored: NDArray[np.float32],
+    stored_field: NDArray[np.float32],
+    stored_ground: NDArray[np.float32],
     *,
     least_shared: float,
     evident: float,
@@ -107,9 +108,10 @@ def search_correlate(
     Parameters
     ----------
     fields, ground : array
-        What `search_spectra` gives for (x, y) and, without the axis of turns, (known ground, energy).
-    stored : array, (4, size, size / 2 + 1, 2)
-        Half spectra of the other field's x, y, known ground and energy.
+        What `search_spectra` gives for (x, y) and, of half the size, for (known ground, energy) summed over
+        2 x 2 pixels.
+    stored_field, stored_ground : array, (2, n, n / 2 + 1, 2)
+        Half spectra of the other field's x and y, and of its known ground and energy.
     least_shared : float
         Pixels that a shift has to share.
     evident : float
@@ -118,7 +120,7 @@ def search_correlate(
     Returns
     -------
     evident : array, (N, 5)
-        Rotation (group * turns + turn), row, column, r^2 and the independent samples in the shared ground,
+        Rotation, row, column, r^2 and the independent samples in the shared ground,
         of poses with r > 0 that agree better than the shifts beside them.
     sample : array, (K,)
         For each rotation the pixels that count as one sample; NaN where no shift shares enough.

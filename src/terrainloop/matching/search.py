@@ -1,12 +1,10 @@
 """Exhaustive search of SE(2) for the poses at which two gradient fields agree, by FFT."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
 from terrainloop import _core
@@ -17,14 +15,11 @@ from terrainloop.matching.field import Field, Image, field_of, turn_field
 
 PIXELS_PER_LENGTH_SCALE = 2  # a finer field tells no more: the spectrum of the process ends there
 MAX_PIXELS = 96  # across; larger maps are searched at twice the spacing, and so on
-TURN = 1.0  # pixels that ground moves between two rotations, root mean square over the map
-GROUP = 3  # rotations that share the sums of energies, which hardly change by a turn
+TURN = 1.0  # pixels that ground moves between two rotations, about; root mean square over the map
 MIN_AREA = 20.0  # of shared ground, in squared length scales
 EVIDENT = 6.0  # r^2 in units of its mean, above which a pose is looked at: one in seventy
 WRAPPED = 0.8  # of the size at which nothing wraps around
 APART = 1.5  # length scales by which two places differ
-
-Spectra = NDArray[np.complex64]
 
 _turning = Lock()  # threads that compare one source wait for its spectra, instead of making them again
 
@@ -72,7 +67,7 @@ class SearchMap:
     def __init__(self, gradient_map: GradientMap) -> None:
         self._map = gradient_map
         self._fields: dict[float, Field] = {}
-        self._spectra: dict[tuple[float, int], Spectra] = {}
+        self._spectra: dict[tuple[float, int], tuple[Image, Image]] = {}
         self.length_scale = gradient_map.parameters.length_scale
         self.spacing = self.length_scale / PIXELS_PER_LENGTH_SCALE
         while max(gradient_map.mask.shape) * gradient_map.resolution > MAX_PIXELS * self.spacing:
@@ -87,12 +82,15 @@ class SearchMap:
             self._fields[spacing] = field_of(self._map, spacing)
         return self._fields[spacing]
 
-    def spectra(self, spacing: float, size: int) -> Spectra:
-        """Spectra (4, size, size // 2 + 1) of the field: x, y, known ground and energy."""
+    def spectra(self, spacing: float, size: int) -> tuple[Image, Image]:
+        """Half spectra (2, n, n / 2 + 1, 2) of x and y, and of known ground and energy on half the grid."""
         if (spacing, size) not in self._spectra:
             field = self.field(spacing)
-            energy = field.x**2 + field.y**2
-            self._spectra[spacing, size] = _spectra_of((field.x, field.y, field.known, energy), size)
+            ground = _coarser(np.stack([field.known, field.x**2 + field.y**2]))
+            self._spectra[spacing, size] = (
+                _spectra_of(np.stack([field.x, field.y]), size),
+                _spectra_of(ground, size // 2),
+            )
         return self._spectra[spacing, size]
 
 
@@ -124,7 +122,7 @@ def search(source: SearchMap, target: SearchMap, count: int) -> Search:
     evident, sample, admissible = _core.search_correlate(
         turned.fields,
         turned.ground,
-        target.spectra(spacing, size).view(np.float32).reshape(4, size, -1, 2),
+        *target.spectra(spacing, size),
         least_shared=MIN_AREA * pixels,
         evident=EVIDENT,
     )
@@ -168,51 +166,55 @@ def _distinct_peaks(poses: Array, apart: float, turns: int, arc: float, count: i
 
 @dataclass(frozen=True, eq=False)
 class _Turned:
-    """A field at K rotations, about the middle of its ground: images, or spectra for the core."""
+    """A field at K rotations, about the middle of its ground: images, or their spectra for the core."""
 
     poses: Array  # (K, 3, 3), from metres of the map to pixels
-    fields: Image  # of every rotation: x and y
-    ground: Image  # of every group of rotations, midst it: known and energy
+    fields: Image  # x and y
+    ground: Image  # known ground and energy, on half the grid
 
 
-@lru_cache(maxsize=3)  # maps of like extent take few sizes
+@lru_cache(maxsize=6)  # maps of like extent take few sizes
 def _turned_spectra(source: SearchMap, spacing: float, size: int) -> _Turned:
     turned = _turned(source, spacing)
-    ground = _core.search_spectra(turned.ground, size)[:, 0]
-    return _Turned(turned.poses, _core.search_spectra(turned.fields, size), ground)
+    fields, ground = _core.search_spectra(turned.fields, size), _core.search_spectra(turned.ground, size // 2)
+    return _Turned(turned.poses, fields, ground)
 
 
 @lru_cache(maxsize=1)
 def _turned(source: SearchMap, spacing: float) -> _Turned:
     field = source.field(spacing)
-    across = _across(field)
-    per_block = TURN * GROUP * _core.LANES * spacing
-    groups = int(np.ceil(2 * np.pi * source.radius / per_block)) * _core.LANES
-    poses = np.empty((groups * GROUP, 3, 3))
-    fields = np.empty((groups, GROUP, 2, across + 1, across + 1), np.float32)
-    ground = np.empty((groups, 1, 2, across + 1, across + 1), np.float32)
+    extent = _across(field) + 1
+    blocks = int(np.ceil(2 * np.pi * source.radius / (TURN * _core.LANES * spacing)))
+    turns = blocks * _core.LANES
+    poses = np.empty((turns, 3, 3))
+    images = np.empty((turns, 4, extent, extent), np.float32)
     pixels_from_metres = np.asarray(np.linalg.inv(field.metres_from_pixels), dtype=float)
     middle = transform(pixels_from_metres, source.middle)
-    centre = np.array([across / 2, across / 2])
-    for k in range(len(poses)):
-        turn = se2(0.0, 0.0, 2 * np.pi * k / len(poses))
+    centre = np.array([extent - 1, extent - 1]) / 2
+    for k in range(turns):
+        turn = se2(0.0, 0.0, 2 * np.pi * k / turns)
         turn[:2, 2] = centre - turn[:2, :2] @ middle
         poses[k] = turn @ pixels_from_metres
-        group, turned = divmod(k, GROUP)
-        if group >= groups // 2:  # half a turn later all is upside down
-            continue
-        x, y, known = turn_field(field, inverse(turn), (across + 1, across + 1))
-        fields[group, turned] = x, y
-        if turned == GROUP // 2:
-            ground[group, 0] = known, x**2 + y**2
-    half = groups // 2
-    fields[half:] = -fields[:half, ..., ::-1, ::-1]
-    ground[half:] = ground[:half, ..., ::-1, ::-1]
-    return _Turned(poses, fields, ground)
+        if k < turns // 2:
+            x, y, known = turn_field(field, inverse(turn), (extent, extent))
+            images[k] = x, y, known, x**2 + y**2
+    half_a_turn = images[: turns // 2, :, ::-1, ::-1]
+    images[turns // 2 :, :2], images[turns // 2 :, 2:] = -half_a_turn[:, :2], half_a_turn[:, 2:]
+    return _Turned(poses, np.ascontiguousarray(images[:, :2]), _coarser(images[:, 2:]))
 
 
-def _spectra_of(images: Sequence[Image], size: int) -> Spectra:
-    return np.asarray(fft.rfft2(np.stack(images), s=(size, size)))
+def _coarser(images: Image) -> Image:
+    """Images (..., n, m) summed over 2 x 2 pixels."""
+    even = np.pad(images, [(0, 0)] * (images.ndim - 2) + [(0, n % 2) for n in images.shape[-2:]])
+    return np.ascontiguousarray(
+        even[..., ::2, ::2] + even[..., 1::2, ::2] + even[..., ::2, 1::2] + even[..., 1::2, 1::2]
+    )
+
+
+def _spectra_of(images: Image, size: int) -> Image:
+    """Half spectra (K, size, size / 2 + 1, 2), real and imaginary, of images (K, rows, columns)."""
+    spectra = np.asarray(fft.rfft2(images, s=(size, size)), dtype=np.complex64)
+    return spectra.view(np.float32).reshape(*spectra.shape, 2)
 
 
 def _size(source: Field, target: Field) -> int:
@@ -223,7 +225,7 @@ def _size(source: Field, target: Field) -> int:
     """
     across, extent = _across(source), max(target.known.shape)
     least = max(int(WRAPPED * (across + extent)), across, extent) + 1
-    return 2 * int(fft.next_fast_len(-(-least // 2), real=True))  # the core wants it even
+    return 4 * int(fft.next_fast_len(-(-least // 4), real=True))  # as the core wants it
 
 
 def _across(field: Field) -> int:

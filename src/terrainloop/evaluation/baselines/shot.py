@@ -25,7 +25,6 @@ from terrainloop.evaluation.baselines.method import NOT_COMPARABLE, Match, Metho
 from terrainloop.geometry import Array
 
 SUPPORT_RADII = (0.075, 0.1)  # tried, in sides of a submap
-RATIOS = (1.0, 0.9)  # tried; 1 takes every reciprocal match
 
 _SOURCES = tuple(Path(__file__).parent / "pcl" / name for name in ("CMakeLists.txt", "shot.cpp"))
 _INSTALL = "apt install libpcl-dev cmake g++"
@@ -53,8 +52,6 @@ class Settings:
         Share of the points, those of highest curvature, that may be keypoints.
     keypoints : int
         Most keypoints of a submap.
-    ratio : float
-        Largest distance to the nearest descriptor in distances to the second nearest.
     inlier_radius : float
         Of RANSAC.
     iterations : int
@@ -68,7 +65,6 @@ class Settings:
     separation: float
     share: float
     keypoints: int
-    ratio: float
     inlier_radius: float
     iterations: int
 
@@ -90,7 +86,9 @@ class Keypoints:
 
 
 def methods(scale: Scale) -> tuple[Method, ...]:
-    """SHOT + RANSAC, then CSHOT + RANSAC, each with every choice of support radius and ratio.
+    """SHOT + RANSAC, then CSHOT + RANSAC, each with every choice of support radius.
+
+    Every reciprocal match is taken: a ratio rule of 0.9 was worse on stereo and on LiDAR submaps.
 
     The score is the number of inliers; pairs with fewer than three matches score 0. CSHOT cannot compare
     submaps without colours. The same input gives the same output.
@@ -105,15 +103,14 @@ def methods(scale: Scale) -> tuple[Method, ...]:
     return tuple(
         Method(
             name=f"{kind.upper()} + RANSAC",
-            settings={"support_radius_m": round(settings.support_radius, 3), "ratio": ratio},
+            settings={"support_radius_m": round(settings.support_radius, 3)},
             software=software,
             describe=partial(_describe, program, settings),
             score=partial(_score, program, settings),
         )
         for kind in _DESCRIPTOR_SIZE
         for radius in SUPPORT_RADII
-        for ratio in RATIOS
-        for settings in [_settings(scale, kind, radius * scale.side, ratio)]
+        for settings in [_settings(scale, kind, radius * scale.side)]
     )
 
 
@@ -168,7 +165,7 @@ def _run(program: Path, *words: object, rows: NDArray[np.float32] | None = None)
     return done.stdout
 
 
-def _settings(scale: Scale, kind: str, support_radius: float, ratio: float) -> Settings:
+def _settings(scale: Scale, kind: str, support_radius: float) -> Settings:
     return Settings(
         kind=kind,
         leaf=max(0.01 * scale.side, 1.5 * scale.spacing),
@@ -177,7 +174,6 @@ def _settings(scale: Scale, kind: str, support_radius: float, ratio: float) -> S
         separation=0.01 * scale.side,
         share=0.5,
         keypoints=1000,
-        ratio=ratio,
         inlier_radius=0.02 * scale.side,
         iterations=50000,
     )
@@ -203,7 +199,7 @@ def _describe(program: Path, settings: Settings, observation: Observation) -> Ke
 def _score(program: Path, settings: Settings, source: Keypoints | None, target: Keypoints | None) -> Match:
     if source is None or target is None:
         return Match(score=NOT_COMPARABLE)
-    i, j = _matches(source.descriptors, target.descriptors, settings.ratio)
+    i, j = _matches(source.descriptors, target.descriptors)
     if len(i) < _FEWEST_MATCHES:
         return Match(score=0.0)
     from_source, to_target = source.points[i].mean(axis=0), target.points[j].mean(axis=0)
@@ -217,13 +213,11 @@ def _score(program: Path, settings: Settings, source: Keypoints | None, target: 
     return Match(score=count, T_target_source=T_target_source)
 
 
-def _matches(source: NDArray[np.float32], target: NDArray[np.float32], ratio: float) -> NDArray[np.intp]:
-    """Rows (2, M) of source and target: each other's nearest, clearly nearer than the second nearest."""
-    if not len(source) or len(target) < 2:
+def _matches(source: NDArray[np.float32], target: NDArray[np.float32]) -> NDArray[np.intp]:
+    """Rows (2, M) of source and target: each other's nearest."""
+    if not len(source) or not len(target):
         return np.empty((2, 0), dtype=np.intp)
     cosine = source @ target.T  # all have length 1, so that the squared distance is 2 - 2 cosine
     nearest = cosine.argmax(axis=1)
-    best, second = -np.partition(-cosine, 1, axis=1)[:, :2].T
-    clear = 1 - best <= ratio**2 * (1 - second)
-    i = np.flatnonzero(clear & (cosine.argmax(axis=0)[nearest] == np.arange(len(source))))
+    i = np.flatnonzero(cosine.argmax(axis=0)[nearest] == np.arange(len(source)))
     return np.stack([i, nearest[i]])
