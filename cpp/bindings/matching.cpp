@@ -76,10 +76,8 @@ auto turn(const AnyArray& x, const AnyArray& y, const AnyArray& known, const Dou
   const Lookup to = affine(lookup);
   const std::size_t height = rows, width = cols;
   std::vector<float> turned(3 * height * width);
-  {
-    nb::gil_scoped_release release;
-    turn_field(images[0], images[1], images[2], to, rows, cols, turned.data());
-  }
+  // Too short to be worth giving up Python's lock, which another thread would take for longer.
+  turn_field(images[0], images[1], images[2], to, rows, cols, turned.data());
   return to_numpy(std::move(turned), {3, height, width});
 }
 
@@ -88,11 +86,8 @@ auto inlier_counts(const Doubles& source, const Doubles& target, const Doubles& 
       source.shape(0) != target.shape(0) || motions.ndim() != 2 || motions.shape(1) != 4)
     throw nb::value_error("source and target must be (A, 2), motions (K, 4)");
   std::vector<int> counts(motions.shape(0));
-  {
-    nb::gil_scoped_release release;
-    count_inliers(source.data(), target.data(), source.shape(0), motions.data(), motions.shape(0), radius,
-                  counts.data());
-  }
+  count_inliers(source.data(), target.data(), source.shape(0), motions.data(), motions.shape(0), radius,
+                counts.data());
   const std::size_t count = counts.size();
   return to_numpy(std::move(counts), {count});
 }

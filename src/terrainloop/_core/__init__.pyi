@@ -90,8 +90,8 @@ LANES: int
 def search_spectra(images: NDArray[np.float32], size: int) -> NDArray[np.float32]:
     """Conjugate half spectra of pairs of images (K, 2, n, n), zero beyond n, for the search.
 
-    They are (K / LANES, 2, size, size / 2 + 1, 2, LANES): real and imaginary parts, then the rotations side by
-    side. The size is even, with no prime factors but 2, 3 and 5.
+    They are (K / LANES, 2, size, size / 2 + 1, 2, LANES): real and imaginary parts, then the rotations
+    side by side. The size is even, with no prime factors but 2, 3 and 5.
     """
 
 def search_correlate(

@@ -1,0 +1,1 @@
+"""The paper's experiments, re-run: ``python -m reproduce`` from the root of the repository."""
