@@ -71,7 +71,7 @@ def trajectories(drives: Sequence[Drive]) -> Plate:
 
 def visual_curves(frames: Sequence[Frames], control: Sequence[Frames]) -> Plate:
     """Precision and recall of visual loop closure over the images (Fig. 7), and of its control."""
-    figure = Figure(figsize=(13, 4.2), layout="constrained")
+    figure = Figure(figsize=(13, 5.0), layout="constrained")
     rows = []
     panels = {
         f"same place, headings within {np.degrees(ALIKE):.0f} deg": [(one, one.alike) for one in frames],
@@ -87,7 +87,8 @@ def visual_curves(frames: Sequence[Frames], control: Sequence[Frames]) -> Plate:
             rows += [{"mission": one.name, "true": title, **_counts(point)} for point in points]
         _unit_axes(axes, "recall")
         axes.set_xlim(-0.03, 1.03)
-        axes.legend(fontsize=7, loc="center", title="images to be found", title_fontsize=7)
+        below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.15), "ncols": 2}
+        axes.legend(fontsize=7, title="images to be found", title_fontsize=7, **below)
         _title(axes, title)
     return Plate(figure, rows)
 
