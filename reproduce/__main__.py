@@ -27,9 +27,10 @@ from reproduce.missions import (
     simulated,
 )
 from reproduce.results import Result, best_of_each
-from reproduce.runner import ROOT, run_all, tasks_of, versions, write_whole
+from reproduce.runner import ROOT, run_all, tasks_of, versions
 from reproduce.visual import frames_of
 from terrainloop.errors import TerrainLoopError
+from terrainloop.io.results import write_whole
 
 STAND_INS = (
     "The paper's datasets are not public: Etna1-4 and Morocco here are simulated stand-ins "

@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 
 from reproduce.missions import Drive
 from reproduce.results import Result
-from reproduce.runner import write_whole
 from reproduce.visual import ALIKE, Frames
 from terrainloop.evaluation.judge import JudgedPair
 from terrainloop.evaluation.precision_recall import OperatingPoint, precision_recall
 from terrainloop.geometry import transform
+from terrainloop.io.results import write_whole
 from terrainloop.report.figures import SOURCE_COLOUR, TARGET_COLOUR, save_figure
 
 INLIER_THRESHOLDS = tuple(range(1, 21))  # the paper's
@@ -206,7 +206,7 @@ def _draw_clouds(axes: Axes, drive: Drive, poses: np.ndarray, source: int, targe
     others = [i for i in range(len(poses)) if i not in (source, target)]
     for i in [*others, target, source]:
         colour = {source: SOURCE_COLOUR, target: TARGET_COLOUR}.get(i, GREY)
-        points = drive.mission.read(i).points
+        points = drive.submaps[i].points
         x, y, _ = transform(poses[i], points[:: max(1, len(points) // DRAWN_POINTS)]).T
         axes.plot(x, y, ".", color=colour, markersize=0.6, alpha=0.35 if colour != GREY else 0.12)
     for name, pose in zip(drive.mission.names, poses, strict=True):

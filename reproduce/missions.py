@@ -1,6 +1,5 @@
 """The missions: simulated stand-ins for the paper's, others beyond it, and real ones where given."""
 
-import csv
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,11 +13,12 @@ import yaml
 from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.baselines.method import Observation, Scale
 from terrainloop.evaluation.overlap import ground_cell, observed_iou
-from terrainloop.io.missions import Mission, load_mission
+from terrainloop.io.missions import Mission, load_mission, read_sessions
 from terrainloop.io.results import SubmapRecord, submap_record
 from terrainloop.io.trajectories import Trajectory, write_tum
 from terrainloop.simulation.missions import SimulatedMission, simulate_mission, write_mission
 from terrainloop.simulation.rendering import colours_of, images_of
+from terrainloop.submap import Submap
 
 SUBMAPS, SUBMAPS_QUICK = 16, 8  # the paper's datasets have about 15
 
@@ -70,10 +70,7 @@ class Drive:
     def sessions(self) -> dict[str, str] | None:
         """Session of each submap by name, where a file beside the clouds tells."""
         file = self.path / SESSIONS_FILE
-        if not file.exists():
-            return None
-        with file.open(newline="", encoding="utf-8") as lines:
-            return dict(list(csv.reader(lines))[1:])
+        return read_sessions(file) if file.exists() else None
 
     @cached_property
     def poses(self) -> np.ndarray:
@@ -87,25 +84,29 @@ class Drive:
         return self.mission.truth.poses
 
     @cached_property
+    def submaps(self) -> list[Submap]:
+        return [self.mission.read(i) for i in range(len(self.mission))]
+
+    @cached_property
     def records(self) -> list[SubmapRecord]:
-        return [submap_record(self.mission.read(i)) for i in range(len(self.mission))]
+        return [submap_record(submap) for submap in self.submaps]
 
     @cached_property
     def scale(self) -> Scale:
-        return Scale.of([self.mission.read(i) for i in range(len(self.mission))])
+        return Scale.of(self.submaps)
 
     @cached_property
     def observed_iou(self) -> np.ndarray:
         """Ground observed by both of two submaps over ground observed by either, (M, M)."""
-        clouds = [self.mission.read(i).points for i in range(len(self.mission))]
+        clouds = [submap.points for submap in self.submaps]
         return observed_iou(clouds, self.poses, ground_cell(clouds))
 
     def observations(self) -> Iterator[Observation]:
         """All that a method may know of each submap, in the order driven."""
         odometry = self.mission.odometry
-        for i, name in enumerate(self.mission.names):
+        for i, (name, submap) in enumerate(zip(self.mission.names, self.submaps, strict=True)):
             yield Observation(
-                self.mission.read(i),
+                submap,
                 None if odometry is None else odometry.poses[i],
                 _colours(self.path / "colours" / f"{name}.npy"),
                 tuple(self.images(name)),

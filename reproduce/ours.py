@@ -21,5 +21,4 @@ SETTINGS: Mapping[str, tuple[str, Settings]] = {
 def method(key: str, drive: Drive) -> Method:
     """One of `SETTINGS`; hyperparameters of a database are those of the mission's first submaps."""
     name, settings = SETTINGS[key]
-    first = [drive.mission.read(i) for i in range(min(ours.FITTED_SUBMAPS, len(drive.mission)))]
-    return ours.method(name, settings, ours.parameters_for(settings, first))
+    return ours.method(name, settings, ours.parameters_for(settings, drive.submaps))

@@ -31,11 +31,11 @@ from terrainloop import __version__
 from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.baselines.method import Match, Method, Scale
 from terrainloop.geometry import parameters_of, se3
+from terrainloop.io.results import POSE_COLUMNS, write_whole
 
 ROOT = Path(__file__).parent.parent
 PROCESSORS = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-POSE_COLUMNS = ("tx_m", "ty_m", "tz_m", "roll_rad", "pitch_rad", "yaw_rad")
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Task:
 
 
 @dataclass(frozen=True, eq=False)
-class ScoredPair:
+class Scored:
     """A pair as a method scored it; what `terrainloop.evaluation.judge` takes."""
 
     source: str
@@ -156,14 +156,16 @@ def run_apart(task: Task, processors: Queue[int]) -> str:
     paths = [str(ROOT), *filter(None, sys.path)]
     log = task.folder / f"{task.stem}.log"
     begin = time.perf_counter()
-    with log.open("w", encoding="utf-8") as output:
-        run = subprocess.run(
-            [sys.executable, "-m", "reproduce.runner", json.dumps(order)],
-            env=os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(paths)},
-            stdout=output,
-            stderr=subprocess.STDOUT,
-        )
-    processors.put(processor)
+    try:
+        with log.open("w", encoding="utf-8") as output:
+            run = subprocess.run(
+                [sys.executable, "-m", "reproduce.runner", json.dumps(order)],
+                env=os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(paths)},
+                stdout=output,
+                stderr=subprocess.STDOUT,
+            )
+    finally:
+        processors.put(processor)
     if run.returncode == 0:
         log.unlink()
         return f"{time.perf_counter() - begin:.0f} s"
@@ -249,14 +251,6 @@ def versions() -> dict[str, str]:
     }
 
 
-def write_whole(path: Path, write) -> None:
-    """Write aside and move into place, so that a killed run never leaves half a file."""
-    aside = path.with_name(f".{path.name}")
-    with aside.open("w", encoding="utf-8", newline="") as file:
-        write(file)
-    aside.replace(path)
-
-
 def _write_pairs(file, scored: Iterable[tuple[str, str, Match]]) -> None:
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(["source", "target", "score", *POSE_COLUMNS])
@@ -265,10 +259,10 @@ def _write_pairs(file, scored: Iterable[tuple[str, str, Match]]) -> None:
         writer.writerow([source, target, *(repr(float(value)) for value in (match.score, *pose))])
 
 
-def read_pairs(path: Path) -> list[ScoredPair]:
+def read_pairs(path: Path) -> list[Scored]:
     with path.open(newline="", encoding="utf-8") as file:
         return [
-            ScoredPair(
+            Scored(
                 row["source"],
                 row["target"],
                 float(row["score"]),

@@ -8,8 +8,8 @@ import numpy as np
 
 from reproduce.figures import write_rows
 from reproduce.results import GROUNDS, READINGS, Result, best_of_each
-from reproduce.runner import write_whole
 from terrainloop.evaluation.precision_recall import Metrics
+from terrainloop.io.results import write_whole
 
 Rows = list[dict[str, Any]]
 

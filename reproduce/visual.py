@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from reproduce.missions import FRAMES_FILE, Drive
-from reproduce.runner import write_whole
 from terrainloop.evaluation.baselines.ibow import closures, features_of
 from terrainloop.geometry import yaw_of
+from terrainloop.io.results import write_whole
 
 SKIPPED = 14  # images just before one: two submaps of 7 m, as pairs of neighbours are left out
 NEAR = 2.0  # metres between two cameras that are at the same place

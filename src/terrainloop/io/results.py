@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +88,7 @@ def read_loops(path: str | Path) -> list[LoopCandidate]:
 
 
 def _candidate(row: dict[str, Any]) -> LoopCandidate:
-    T_target_source = se3(*[row.pop(name) for name in _POSE_COLUMNS])
+    T_target_source = se3(*[row.pop(name) for name in POSE_COLUMNS])
     covariance = np.empty((6, 6))
     covariance[_UPPER] = [row.pop(name) for name in _COVARIANCE_COLUMNS]
     covariance.T[_UPPER] = covariance[_UPPER]
@@ -131,12 +131,12 @@ _POLYGON: Kind = (_polygon_text, _polygon_of)
 
 _UPPER = np.triu_indices(6)
 _PARAMETERS = ("x", "y", "z", "roll", "pitch", "yaw")
-_POSE_COLUMNS = ("tx_m", "ty_m", "tz_m", "roll_rad", "pitch_rad", "yaw_rad")
+POSE_COLUMNS = ("tx_m", "ty_m", "tz_m", "roll_rad", "pitch_rad", "yaw_rad")
 _COVARIANCE_COLUMNS = [f"cov_{_PARAMETERS[i]}_{_PARAMETERS[j]}" for i, j in zip(*_UPPER, strict=True)]
 _LOOP_COLUMNS: dict[str, Kind] = {
     "source": _TEXT,
     "target": _TEXT,
-    **dict.fromkeys(_POSE_COLUMNS, _NUMBER),
+    **dict.fromkeys(POSE_COLUMNS, _NUMBER),
     "inliers": _COUNT,
     **dict.fromkeys(("ssd", "overlap", "score"), _NUMBER),
     "accepted": _FLAG,
@@ -156,18 +156,25 @@ _SUBMAP_COLUMNS: dict[str, Kind] = {
 }
 
 
-def _write_table(path: Path, columns: dict[str, Kind], rows: Iterable[Sequence[Any]]) -> None:
-    # Written aside and moved into place, so that a killed run never leaves half a file.
+def write_whole(path: Path, write: Callable[[TextIO], object]) -> None:
+    """Write a file aside and move it into place, so that a killed run never leaves half a file."""
     aside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with aside.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
-            for row in rows:
-                writer.writerow([write(v) for (write, _), v in zip(columns.values(), row, strict=True)])
+            write(file)
         aside.replace(path)
     finally:
         aside.unlink(missing_ok=True)
+
+
+def _write_table(path: Path, columns: dict[str, Kind], rows: Iterable[Sequence[Any]]) -> None:
+    def write(file: TextIO) -> None:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        for row in rows:
+            writer.writerow([written(v) for (written, _), v in zip(columns.values(), row, strict=True)])
+
+    write_whole(path, write)
 
 
 def _read_table(path: Path, columns: dict[str, Kind]) -> list[dict[str, Any]]:
