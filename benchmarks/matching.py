@@ -37,7 +37,7 @@ from terrainloop.detection.mission import _fit_mission
 from terrainloop.evaluation.judge import judge
 from terrainloop.evaluation.overlap import world_boxes
 from terrainloop.geometry import inverse, parameters_of, yaw_of
-from terrainloop.io.missions import load_mission
+from terrainloop.io.missions import load_mission, read_sessions
 from terrainloop.io.results import submap_record
 from terrainloop.io.trajectories import read_trajectory
 from terrainloop.matching import by_evidence
@@ -82,7 +82,7 @@ def mapped(folder):
     submaps, records = pickle.loads(cache.read_bytes())
     sessions = None
     if (folder / "passes.csv").exists():
-        sessions = dict(line.split(",") for line in (folder / "passes.csv").read_text().split()[1:])
+        sessions = read_sessions(folder / "passes.csv")
     return submaps, records, read_trajectory(folder / "truth.tum").poses, sessions
 
 

@@ -61,6 +61,7 @@ def command(
     from terrainloop.config import Settings
     from terrainloop.evaluation.judge import judge, readings
     from terrainloop.evaluation.precision_recall import precision_recall
+    from terrainloop.io.missions import read_sessions
     from terrainloop.io.results import read_loops, read_submaps
     from terrainloop.io.trajectories import read_trajectory
 
@@ -71,7 +72,7 @@ def command(
         candidates,
         records,
         poses,
-        _read_sessions(sessions) if sessions else None,
+        read_sessions(sessions) if sessions else None,
         _observed(clouds, records, poses) if clouds else None,
     )
     name, thresholds, values = _scores(pairs, Settings.from_yaml(run / "config.yaml").match)
@@ -258,19 +259,6 @@ def _row(name: str, point: "OperatingPoint", pose_precision: float) -> dict[str,
 def _write_rows(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([columns, *rows])
-
-
-def _read_sessions(path: Path) -> dict[str, str]:
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = [row for row in csv.reader(file) if row]
-        return dict(rows[1:])
-    except (OSError, ValueError, IndexError) as error:
-        raise TerrainLoopError(
-            expected=f"a header and two columns, cloud and session, in {path}",
-            found=str(error),
-            mend="mend the file",
-        ) from error
 
 
 def _median(values: Sequence[float]) -> float:

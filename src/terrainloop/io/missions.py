@@ -1,5 +1,6 @@
 """Missions: folders of submaps, one cloud a file, with their odometry and truth where known."""
 
+import csv
 import logging
 import re
 from collections import Counter
@@ -149,3 +150,23 @@ def _trajectory(path: Path, name: str, count: int) -> Trajectory | None:
             mend="give one line a cloud, in the order of the file names",
         )
     return trajectory
+
+
+def read_sessions(path: Path | str) -> dict[str, str]:
+    """Session of each cloud by name, from a CSV with a header and two columns, cloud and session.
+
+    Raises
+    ------
+    TerrainLoopError
+        If it cannot be read as that.
+    """
+    try:
+        with Path(path).open(newline="", encoding="utf-8") as file:
+            rows = [row for row in csv.reader(file) if row]
+        return dict(rows[1:])
+    except (OSError, ValueError, IndexError) as error:
+        raise TerrainLoopError(
+            expected=f"a header and two columns, cloud and session, in {path}",
+            found=str(error),
+            mend="mend the file",
+        ) from error
