@@ -12,11 +12,8 @@ from terrainloop.evaluation.baselines.ibow import (
     epipolar_inliers,
     features_of,
     methods,
-    shared_view,
-    views_agree,
 )
 from terrainloop.evaluation.baselines.method import NOT_COMPARABLE, Observation, Scale
-from terrainloop.geometry import se3
 from terrainloop.submap import Submap
 
 
@@ -156,31 +153,3 @@ def test_a_large_vocabulary_is_searched_almost_as_well_and_always_alike(monkeypa
     np.testing.assert_array_equal(hashed, similarity())
     assert hashed[2] == pytest.approx(exhaustive[2], rel=0.15)
     assert hashed[2] > 3 * np.delete(hashed, 2).max()
-
-
-def test_views_agree_by_place_and_direction():
-    poses = np.stack(
-        [
-            se3(0, 0, 1, 0, 0.35, 0),
-            se3(1.5, 0, 1, 0, 0.35, np.radians(25)),
-            se3(1.5, 0, 1, 0, 0.35, np.radians(40)),
-            se3(2.5, 0, 1, 0, 0.35, 0),
-        ]
-    )
-    assert views_agree(poses)[0].tolist() == [True, True, False, False]
-
-
-def test_shared_view_is_the_part_of_a_fan_that_another_sees():
-    fan = np.pi * 8**2 * 70 / 360  # square metres
-    poses = np.stack([se3(0, 0, 1, 0, 0.35, 0.5), se3(0, 0, 1, 0, 0.35, 0.5), se3(-9, 0, 1, 0, 0.35, np.pi)])
-    share = shared_view(poses, reach=8.0, half_angle_deg=35.0)
-    np.testing.assert_allclose(share, [[1, 1, 0], [1, 1, 0], [0, 0, 1]])
-    # Seen from 3 m behind, by Monte Carlo.
-    xy = np.random.default_rng(0).uniform(-8, 8, (400_000, 2))
-    ahead = (np.hypot(*xy.T) < 8) & (np.abs(np.arctan2(xy[:, 1], xy[:, 0])) < np.radians(35))
-    back = xy + np.array([3.0, 0.0])
-    both = ahead & (np.hypot(*back.T) < 8) & (np.abs(np.arctan2(back[:, 1], back[:, 0])) < np.radians(35))
-    expected = both.mean() * 16**2 / fan
-    behind = shared_view(np.stack([se3(0, 0, 1, 0, 0.35, 0), se3(-3, 0, 1, 0, 0.35, 0)]))
-    assert behind[1, 0] == pytest.approx(expected, abs=0.06)
-    assert behind[0, 1] == pytest.approx(expected, abs=0.06)

@@ -284,12 +284,9 @@ class _Surface:
 
 def _at_nodes(layers: Image, terrain: Terrain, xy: Array) -> Image:
     """Bilinear values (N, layers) of images (rows, columns, layers) over the terrain's nodes."""
-    rows, columns, depth = layers.shape
-    x, y = ((xy - terrain.origin) / terrain.resolution).T
-    x, y = np.clip(x, 0, columns - 1), np.clip(y, 0, rows - 1)
-    column, row = np.minimum(x.astype(np.int64), columns - 2), np.minimum(y.astype(np.int64), rows - 2)
-    u, v = (x - column).astype(np.float32)[:, None], (y - row).astype(np.float32)[:, None]
-    corner, nodes = row * columns + column, layers.reshape(-1, depth)
+    columns, nodes = layers.shape[1], layers.reshape(-1, layers.shape[2])
+    corner, x, y = terrain.cell_at(xy)
+    u, v = x.astype(np.float32)[:, None], y.astype(np.float32)[:, None]
     lower = nodes[corner] * (1 - u) + nodes[corner + 1] * u
     upper = nodes[corner + columns] * (1 - u) + nodes[corner + columns + 1] * u
     return np.asarray(lower * (1 - v) + upper * v)

@@ -35,16 +35,24 @@ class Terrain:
 
     def height_at(self, xy: ArrayLike) -> Array:
         """Bilinear height in metres at world points (..., 2); outside, that of the nearest border."""
+        (corner, x, y), columns, nodes = self.cell_at(xy), self.height.shape[1], self.height.ravel()
+        lower = nodes[corner] * (1 - x) + nodes[corner + 1] * x
+        upper = nodes[corner + columns] * (1 - x) + nodes[corner + columns + 1] * x
+        return np.asarray(lower * (1 - y) + upper * y)
+
+    def cell_at(self, xy: ArrayLike) -> tuple[NDArray[np.int64], Array, Array]:
+        """The cell between four nodes that world points (..., 2) lie in, or the nearest one.
+
+        Returns the node of its low corner, counted along the rows, and how far beyond it along x and y the
+        points lie, 0 to 1.
+        """
         xy = np.asarray(xy, dtype=float)
         rows, columns = self.height.shape
         x = np.clip((xy[..., 0] - self.origin[0]) / self.resolution, 0, columns - 1)
         y = np.clip((xy[..., 1] - self.origin[1]) / self.resolution, 0, rows - 1)
         column = np.minimum(x.astype(np.int64), columns - 2)
         row = np.minimum(y.astype(np.int64), rows - 2)
-        x, y, corner, nodes = x - column, y - row, row * columns + column, self.height.ravel()
-        lower = nodes[corner] * (1 - x) + nodes[corner + 1] * x
-        upper = nodes[corner + columns] * (1 - x) + nodes[corner + columns + 1] * x
-        return np.asarray(lower * (1 - y) + upper * y)
+        return row * columns + column, x - column, y - row
 
     def slope_at(self, xy: ArrayLike) -> Array:
         """Gradient (..., 2) of the height at world points (..., 2), by central differences."""

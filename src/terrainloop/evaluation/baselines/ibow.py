@@ -271,32 +271,3 @@ def _score(source: _Seen, target: _Seen) -> Match:
     likeliest = (int(np.argmax(target.vocabulary.similarity(image))) for image in source.images)
     pairs = zip(source.images, likeliest, strict=True)
     return Match(float(max(epipolar_inliers(target.images[found], image) for image, found in pairs)))
-
-
-def views_agree(T_world_camera: Array, within: float = 2.0, turn_deg: float = 30.0) -> NDArray[np.bool_]:
-    """Whether every two of K poses (K, 4, 4) are so near and look so much the same way, (K, K)."""
-    positions, turns = T_world_camera[:, :3, 3], T_world_camera[:, :3, :3]
-    apart = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    cosine = (np.einsum("iab,jab->ij", turns, turns) - 1) / 2
-    return np.asarray((apart <= within) & (cosine >= np.cos(np.radians(turn_deg))))
-
-
-def shared_view(T_world_camera: Array, reach: float = 8.0, half_angle_deg: float = 35.0) -> Array:
-    """Share of the ground that a camera looks at which another looks at too, (K, K), for K poses (K, 4, 4).
-
-    The ground is a fan ahead of the camera, up to ``reach`` metres away. Views may share it though they do
-    not agree: from a few metres further back, or from the other side.
-    """
-    across, along = (np.arange(9) + 0.5) / 9, (np.arange(8) + 0.5) / 8  # cells of equal area
-    bearing, distance = np.meshgrid(np.radians(half_angle_deg) * (2 * across - 1), reach * np.sqrt(along))
-    ahead = np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], axis=-1).reshape(-1, 2)
-    heading = np.arctan2(T_world_camera[:, 1, 0], T_world_camera[:, 0, 0])
-    turned = np.exp(1j * heading)[:, None] * (ahead[:, 0] + 1j * ahead[:, 1])
-    position = T_world_camera[:, 0, 3] + 1j * T_world_camera[:, 1, 3]
-    ground = position[:, None] + turned
-    share = np.empty((len(position), len(position)))
-    for i, (at, facing) in enumerate(zip(position, heading, strict=True)):
-        seen = (ground - at) * np.exp(-1j * facing)
-        within = (np.abs(seen) <= reach) & (np.abs(np.angle(seen)) <= np.radians(half_angle_deg))
-        share[i] = within.mean(axis=1)
-    return share
