@@ -5,6 +5,7 @@ same ground, turning and shifting one makes the vectors agree, everywhere at onc
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from terrainloop import _core
-from terrainloop.geometry import Array, inverse
+from terrainloop.geometry import Array, inverse, transform
 from terrainloop.gradient_map import GradientMap
 
 FLOOR = 0.3  # of the mean power: waves below it are not raised, for they may be noise
@@ -52,6 +53,17 @@ class Field:
         """Affine map (3, 3) from (column, row) to metres."""
         x, y = self.origin
         return np.array([[self.spacing, 0.0, x], [0.0, self.spacing, y], [0.0, 0.0, 1.0]])
+
+    @property
+    def ground(self) -> Array:
+        """Middles (N, 2) of the known pixels, metres."""
+        return transform(self.metres_from_pixels, np.argwhere(self.known)[:, ::-1].astype(float))
+
+    @cached_property
+    def across(self) -> int:
+        """Pixels of a square that holds the known ground at every rotation about its middle."""
+        ground = self.ground / self.spacing
+        return int(np.ceil(2 * np.hypot(*(ground - ground.mean(axis=0)).T).max())) + 4 if len(ground) else 0
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ class SearchMap:
         self.spacing = self.length_scale / PIXELS_PER_LENGTH_SCALE
         while max(gradient_map.mask.shape) * gradient_map.resolution > MAX_PIXELS * self.spacing:
             self.spacing *= 2
-        ground = _ground(self.field(self.spacing))
+        ground = self.field(self.spacing).ground
         self.middle = ground.mean(axis=0) if len(ground) else np.array(gradient_map.origin)
         self.radius = float(np.sqrt(((ground - self.middle) ** 2).sum() / max(len(ground), 1)))
 
@@ -183,7 +183,7 @@ def _turned_spectra(source: SearchMap, spacing: float, size: int) -> _Turned:
 @lru_cache(maxsize=1)
 def _turned(source: SearchMap, spacing: float) -> _Turned:
     field = source.field(spacing)
-    extent = _across(field) + 1
+    extent = field.across + 1
     blocks = int(np.ceil(2 * np.pi * source.radius / (TURN * _core.LANES * spacing)))
     turns = blocks * _core.LANES
     poses = np.empty((turns, 3, 3))
@@ -223,17 +223,6 @@ def _size(source: Field, target: Field) -> int:
     Shifts at which maps share only a rim wrap around and add to those at the other side: that costs
     nothing but the sight of such rims, and saves a third of the time.
     """
-    across, extent = _across(source), max(target.known.shape)
+    across, extent = source.across, max(target.known.shape)
     least = max(int(WRAPPED * (across + extent)), across, extent) + 1
     return 4 * int(fft.next_fast_len(-(-least // 4), real=True))  # as the core wants it
-
-
-def _across(field: Field) -> int:
-    """Pixels of a square that holds the known ground at every rotation about its middle."""
-    ground = _ground(field) / field.spacing
-    return int(np.ceil(2 * np.hypot(*(ground - ground.mean(axis=0)).T).max())) + 4 if len(ground) else 0
-
-
-def _ground(field: Field) -> Array:
-    """Middles (N, 2) of the known pixels, metres."""
-    return transform(field.metres_from_pixels, np.argwhere(field.known)[:, ::-1].astype(float))
