@@ -18,11 +18,13 @@ import platform
 import time
 from collections import defaultdict
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import replace
-from functools import lru_cache, partial
+from contextlib import ExitStack
+from functools import lru_cache
 from itertools import combinations
 from multiprocessing import get_context
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -38,26 +40,31 @@ from terrainloop.evaluation.judge import judge
 from terrainloop.evaluation.overlap import world_boxes
 from terrainloop.geometry import inverse, parameters_of, yaw_of
 from terrainloop.io.missions import load_mission, read_sessions
-from terrainloop.io.results import submap_record
 from terrainloop.io.trajectories import read_trajectory
-from terrainloop.matching import by_evidence
-from terrainloop.matching.register import compare
-from terrainloop.matching.search import SearchMap
+from terrainloop.matching import decision, hypotheses, register
+from terrainloop.matching.register import compare, compare_many
+from terrainloop.record import SubmapRecord
 from terrainloop.simulation.missions import SETUPS, _submap
 from terrainloop.simulation.odometry import estimate, true_poses
 from terrainloop.simulation.paths import revisiting_path
 from terrainloop.simulation.terrain import make_terrain
 
-CACHE = Path.home() / ".cache" / "terrainloop-benchmarks"
+CACHE = Path.home() / ".cache" / "terrainloop-benchmarks-new"
 BANDS = ((0.3, 1.0), (0.1, 0.3))
 EVIDENCE = Settings()
 INLIERS = Settings.model_validate({"match": {"decision": "inliers"}})
-# What proposes, and what decides: the dense places, the inlier sets looked at, the settings.
+
+
+def proposing(dense, ransac):
+    """The default with other numbers of hypotheses from the search, and of inlier sets from the keypoints."""
+    return Settings.model_validate({"calibration": {"dense_hypotheses": dense, "ransac_hypotheses": ransac}})
+
+
 METHODS = {
-    "keypoints, inlier count": (0, 0, INLIERS),
-    "keypoints, evidence": (0, 20, EVIDENCE),
-    "dense, evidence": (2, 0, EVIDENCE),
-    "both, evidence (default)": (2, 6, EVIDENCE),
+    "keypoints, inlier count": INLIERS,
+    "keypoints, evidence": proposing(0, 20),
+    "dense, evidence": proposing(2, 0),
+    "both, evidence (default)": EVIDENCE,
 }
 
 
@@ -73,27 +80,24 @@ def mapped(folder):
     if not cache.exists():
         parameters = _fit_mission(mission, EVIDENCE, 2)
         submaps = [mission.read(index) for index in range(len(mission))]
-        content = (
-            [map_submap(s, EVIDENCE, parameters, workers=2) for s in submaps],
-            list(map(submap_record, submaps)),
-        )
+        content = [map_submap(s, EVIDENCE, parameters, workers=2) for s in submaps]
         CACHE.mkdir(parents=True, exist_ok=True)
         cache.write_bytes(pickle.dumps(content))
-    submaps, records = pickle.loads(cache.read_bytes())
+    entries = pickle.loads(cache.read_bytes())
     sessions = None
     if (folder / "passes.csv").exists():
         sessions = read_sessions(folder / "passes.csv")
-    return submaps, records, read_trajectory(folder / "truth.tum").poses, sessions
+    records = [entry.record for entry in entries]
+    return entries, records, read_trajectory(folder / "truth.tum").poses, sessions
 
 
 def compare_all(job):
     """One submap of one mission against several of another."""
-    dense, looked_at, settings, source, index, target, others, pairs = job
+    settings, source, index, target, others, pairs = job
     cv2.setNumThreads(1)
-    by_evidence.DENSE, by_evidence.LOOKED_AT = dense, looked_at
     query, stored = mapped(source)[0][index], mapped(target)[0]
     with threadpool_limits(1):
-        return [compare(query, stored[other], settings, pairs=pairs) for other in others]
+        return compare_many(query, [stored[other] for other in others], settings, pairs=pairs)
 
 
 def processes():
@@ -109,7 +113,7 @@ def judged(pool, folder, method):
         others = [
             j for j in range(i - 1) if sessions is None or sessions[submap.name] != sessions[submaps[j].name]
         ]
-        jobs.append((*METHODS[method], folder, i, folder, others, len(submaps) * (len(submaps) - 1) / 2))
+        jobs.append((METHODS[method], folder, i, folder, others, len(submaps) * (len(submaps) - 1) / 2))
     candidates = [c for found in pool.map(compare_all, jobs) for c in found]
     turned = {
         (records[i].name, records[j].name): abs(yaw_of(inverse(poses[j]) @ poses[i]))
@@ -183,7 +187,7 @@ def null(folders, figure):
     with processes() as pool:
         for a, b in combinations(folders, 2):
             others = list(range(len(mapped(b)[0])))
-            jobs = [(2, 6, loosened, a, i, b, others, 1.0) for i in range(len(mapped(a)[0]))]
+            jobs = [(loosened, a, i, b, others, 1.0) for i in range(len(mapped(a)[0]))]
             for found in pool.map(compare_all, jobs):
                 scores[" ".join(sorted({a.name.split("_")[0], b.name.split("_")[0]}))] += [
                     c.score for c in found
@@ -272,13 +276,11 @@ def errors(folders, figure):
 def query_time(folders, _):
     """The last submap against 14 others; stages are timed on one thread."""
     cv2.setNumThreads(1)
-    submaps = mapped(folders[0])[0]
-    stored = submaps[:14]
+    entries = mapped(folders[0])[0]
+    query, stored = entries[-1], entries[:14]
     spent = defaultdict(float)
 
-    def timed(name):
-        original = getattr(by_evidence, name)
-
+    def timed(name, original):
         def wrapper(*args, **kwargs):
             start = time.perf_counter()
             try:
@@ -286,32 +288,34 @@ def query_time(folders, _):
             finally:
                 spent[name] += time.perf_counter() - start
 
-        return original, wrapper
+        return wrapper
 
-    def work():  # of a submap that nothing has been kept of yet
-        query = replace(submaps[-1], search_map=SearchMap(submaps[-1].gradient_map))
-        return partial(compare, query, settings=EVIDENCE, pairs=105)
-
-    print(f"{platform.machine()}, {folders[0].name}, submap {submaps[-1].name} against {len(stored)}")
+    print(f"{platform.machine()}, {folders[0].name}, submap {query.name} against {len(stored)}")
     with threadpool_limits(1):
         for threads in (1, 2):
             times = []
             for _ in range(7):
-                query = work()
                 start = time.perf_counter()
-                with ThreadPoolExecutor(threads) as pool:
-                    list(pool.map(query, stored))
+                compare_many(query, stored, EVIDENCE, pairs=105, workers=threads)
                 times.append(time.perf_counter() - start)
             print(f"{threads} thread(s): median {1e3 * np.median(times):.0f} ms")
-        stages = ("search", "associate", "_hypotheses", "refine_roughly", "refine", "_candidate")
-        originals = {name: timed(name) for name in stages}
-        for name, (_, wrapper) in originals.items():
-            setattr(by_evidence, name, wrapper)
-        list(map(work(), stored))
-        for name, (original, _) in originals.items():
-            setattr(by_evidence, name, original)
-    for name in stages:
-        print(f"  {name}: {1e3 * spent[name] / len(stored):.2f} ms a pair")
+        stages = (
+            *((register, name) for name in ("search_grid", "rotate", "Query")),
+            *((hypotheses, name) for name in ("search", "associate", "propose", "refine")),
+            *((decision, name) for name in ("propose_hypotheses", "refine", "_objection", "_candidate")),
+        )
+        with ExitStack() as stack:
+            for module, name in stages:
+                label = f"{module.__name__.rpartition('.')[2]}.{name}"
+                whole = getattr(module, name)
+                if name == "Query":
+                    whole = SimpleNamespace(of=timed(label, whole.of))
+                else:
+                    whole = timed(label, whole)
+                stack.enter_context(patch.object(module, name, whole))
+            compare_many(query, stored, EVIDENCE, pairs=105)
+    for name, seconds in spent.items():
+        print(f"  {name}: {1e3 * seconds / len(stored):.2f} ms per pair")
 
 
 def sensors(_, __):
@@ -348,7 +352,7 @@ def sensors(_, __):
         candidates = [
             compare(b, a, EVIDENCE, pairs=len(stereo) * first) for b in ready[first:] for a in ready[:first]
         ]
-        records = [submap_record(s) for s in submaps]
+        records = [SubmapRecord.of(s) for s in submaps]
         boxes = world_boxes([record.hull for record in records], np.array(poses))
         low = np.maximum(boxes[:, None, :2], boxes[:, :2])
         shared = np.clip(np.minimum(boxes[:, None, 2:], boxes[:, 2:]) - low, 0, None).prod(axis=-1)

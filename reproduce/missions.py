@@ -14,7 +14,7 @@ from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.baselines.method import Observation, Scale
 from terrainloop.evaluation.overlap import ground_cell, observed_iou
 from terrainloop.io.missions import Mission, load_mission, read_sessions
-from terrainloop.io.results import SubmapRecord, submap_record
+from terrainloop.record import SubmapRecord
 from terrainloop.io.trajectories import Trajectory, write_tum
 from terrainloop.simulation.missions import SimulatedMission, simulate_mission, write_mission
 from terrainloop.simulation.rendering import colours_of, images_of
@@ -89,7 +89,7 @@ class Drive:
 
     @cached_property
     def records(self) -> list[SubmapRecord]:
-        return [submap_record(submap) for submap in self.submaps]
+        return [SubmapRecord.of(submap) for submap in self.submaps]
 
     @cached_property
     def scale(self) -> Scale:

@@ -18,7 +18,8 @@ from terrainloop.matching.evidence import (
     surprise_of_both,
     surprise_of_inliers,
 )
-from terrainloop.matching.mapped import MappedSubmap
+from terrainloop.entry import MapEntry
+from terrainloop.record import SubmapRecord
 from terrainloop.matching.refine import USUAL_STRAIN, refine
 from terrainloop.matching.register import compare, register
 
@@ -215,7 +216,7 @@ def test_maps_that_are_stretched_are_found_so(world):
 
 
 def mapped(name, gradient_map):
-    return MappedSubmap.of(name, gradient_map, STRICT)
+    return MapEntry.of(SubmapRecord(name), gradient_map, STRICT)
 
 
 def judge(source, target, *, pairs=1, **match):

@@ -14,7 +14,8 @@ from terrainloop.gradient_map import GradientMap
 from terrainloop.matching.by_inliers import align
 from terrainloop.matching.correspondences import Associations, associate
 from terrainloop.matching.lift import covariance_of_inliers, lift_to_se3
-from terrainloop.matching.mapped import MappedSubmap
+from terrainloop.entry import MapEntry
+from terrainloop.record import SubmapRecord
 from terrainloop.matching.ransac import get_inliers, register_by_ransac, select_random_associations
 from terrainloop.matching.refine import refine
 from terrainloop.matching.register import compare, register

@@ -1,18 +1,22 @@
 """Loop closures from the shape of the ground, by Gaussian-process gradient maps."""
 
-from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
+from importlib import import_module as _import_module
+from importlib.metadata import PackageNotFoundError as _PackageNotFoundError
+from importlib.metadata import version as _version
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from terrainloop.config import Settings
     from terrainloop.detection.detector import LoopDetector
+    from terrainloop.detection.mission import detect_mission
+    from terrainloop.detection.run import Run
+    from terrainloop.entry import MapEntry
     from terrainloop.errors import TerrainLoopError
     from terrainloop.gp.hyperparameters import fit_hyperparameters
     from terrainloop.gp.kernel import Hyperparameters
     from terrainloop.gp.process import ElevationProcess
     from terrainloop.gradient_map import GradientMap
-    from terrainloop.io.clouds import read_cloud
+    from terrainloop.io.clouds import read_cloud, write_cloud
     from terrainloop.io.missions import Mission, load_mission
     from terrainloop.loop import LoopCandidate
     from terrainloop.matching.register import register
@@ -24,14 +28,18 @@ _HOME = {
     "Hyperparameters": "gp.kernel",
     "LoopCandidate": "loop",
     "LoopDetector": "detection.detector",
+    "MapEntry": "entry",
     "Mission": "io.missions",
+    "Run": "detection.run",
     "Settings": "config",
     "Submap": "submap",
     "TerrainLoopError": "errors",
+    "detect_mission": "detection.mission",
     "fit_hyperparameters": "gp.hyperparameters",
     "load_mission": "io.missions",
     "read_cloud": "io.clouds",
     "register": "matching.register",
+    "write_cloud": "io.clouds",
 }
 
 __all__ = [
@@ -40,19 +48,23 @@ __all__ = [
     "Hyperparameters",
     "LoopCandidate",
     "LoopDetector",
+    "MapEntry",
     "Mission",
+    "Run",
     "Settings",
     "Submap",
     "TerrainLoopError",
+    "detect_mission",
     "fit_hyperparameters",
     "load_mission",
     "read_cloud",
     "register",
+    "write_cloud",
 ]
 
 try:
-    __version__ = version("terrainloop")
-except PackageNotFoundError:  # run from a source tree that is not installed
+    __version__ = _version("terrainloop")
+except _PackageNotFoundError:  # run from a source tree that is not installed
     __version__ = "unknown"
 
 
@@ -60,8 +72,8 @@ def __getattr__(name: str) -> object:
     # Loaded when first asked for, so that the command line answers --help at once.
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    return getattr(_import_module(f"{__name__}.{_HOME[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+    return [*__all__, "__version__"]

@@ -1,10 +1,10 @@
 """Settings: few, in metres or dimensionless, derived from one another where they can be."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from terrainloop.errors import TerrainLoopError
 
@@ -41,10 +41,13 @@ class MapSettings(_Frozen):
         None, gt=0, description="grid spacing, m per pixel; null: a sixth of the length scale"
     )
     remove_plane: bool = Field(
-        True, description="take a plane out, and points far off it; give its slope back"
+        True, description="subtract a robust plane fit, and drop gross outliers, before; add its slope after"
     )
     max_variance_ratio: float = Field(
-        0.25, gt=0, lt=1, description="ground is known where the variance is below this share of the prior's"
+        0.25,
+        gt=0,
+        lt=1,
+        description="ground is observed where the variance is below this share of the prior's",
     )
 
 
@@ -59,30 +62,113 @@ class MatchSettings(_Frozen):
     """How two maps are compared, and what makes a loop."""
 
     decision: Literal["evidence", "inliers"] = Field(
-        "evidence", description="evidence: false alarms expected by chance; inliers: Algorithm 1 of the paper"
+        "evidence", description="evidence: number of false alarms; inliers: Algorithm 1 of the paper"
     )
     max_false_loops: float = Field(
-        0.01, gt=0, description="evidence: false loops to be expected in a whole mission"
+        0.01, gt=0, description="evidence: expected number of false loop closures per mission"
     )
-    iterations: int = Field(5000, ge=1, description="pairs of keypoint associations drawn")
+    iterations: int = Field(5000, ge=1, description="RANSAC draws of two keypoint associations")
     inlier_radius: float | None = Field(
         None, gt=0, description="largest distance of an inlier, m; null: half the length scale"
     )
-    min_inliers: int = Field(5, ge=2, description="inliers: as many make a loop (n_min)")
+    min_inliers: int = Field(5, ge=2, description="inliers: minimum number of inliers, n_min")
     max_ssd_ratio: float = Field(
         0.5, gt=0, description="inliers: largest SSD, as a share of what unrelated ground would give"
     )
-    refine: bool = Field(True, description="inliers: settle the pose on the gradients of all shared ground")
+    refine: bool = Field(
+        True, description="inliers: refine the pose by least squares on all overlapping gradients"
+    )
+
+
+class Calibration(_Frozen):
+    """Measured constants that `max_false_loops` rests on (docs/calibration.md); not meant to be changed."""
+
+    # The gradient field (docs/matching.md, section 1)
+    pixels_per_length_scale: float = Field(2.0, gt=0, description="field: pixels per length scale")
+    max_pixels: int = Field(96, ge=8, description="field: pixels across; larger maps take twice the spacing")
+    blur: float = Field(0.4, gt=0, description="field: standard deviation of the low-pass filter, pixels")
+    spectrum_smoothing: float = Field(1.5, gt=0, description="field: of the power spectrum, cycles per width")
+    whitening_floor: float = Field(0.3, gt=0, description="field: added to the spectrum, share of its mean")
+    clip: float = Field(1.5, gt=0, description="field: soft-clipping scale, robust standard deviations")
+    # Hypotheses (section 2)
+    rotation_step: float = Field(1.0, gt=0, description="search: pixels ground moves by, RMS, per rotation")
+    min_shared_area: float = Field(20.0, gt=0, description="search: shared area, squared length scales")
+    min_separation: float = Field(1.5, gt=0, description="search: between two places, length scales")
+    peak_threshold: float = Field(6.0, gt=0, description="search: r^2 of a candidate, in units of its mean")
+    wraparound: float = Field(
+        0.8, gt=0, le=1, description="search: FFT size, share of that without wrap-around"
+    )
+    candidates: int = Field(11, ge=2, description="search: places whose surprisal is kept for the null")
+    dense_hypotheses: int = Field(2, ge=0, description="hypotheses of the search that are refined")
+    sparse_hypotheses: int = Field(1, ge=0, description="hypotheses of the keypoints that are refined")
+    ransac_hypotheses: int = Field(6, ge=0, description="largest inlier sets that are weighed")
+    # Significance (section 3)
+    tail: float = Field(0.85, gt=0, description="calibrated nats per nat of the correlation's formula")
+    independent_tests: float = Field(
+        0.05, gt=0, description="independent tests per rotation step and squared length scale of shift"
+    )
+    max_correlation: float = Field(0.999, gt=0, lt=1, description="correlation beyond which none counts more")
+    # Decision (section 3)
+    min_correlation: float = Field(0.25, ge=0, lt=1, description="of the fields of a loop closure")
+    ambiguity_ratio: float = Field(0.5, gt=0, description="surprisal of a rival pose, share of the best's")
+    ambiguity_chance: float = Field(0.01, gt=0, description="NFA above which a rival is left to chance")
+    # Covariance (section 4)
+    block: float = Field(2.0, gt=0, description="side of the independent blocks of ground, length scales")
+    usual_strain: float = Field(0.004, ge=0, description="standard deviation of a submap's strain, a priori")
+    usual_strain_samples: float = Field(3.0, gt=0, description="samples that this prior is worth")
+    motion_by_strain: tuple[float, float, float] = Field(
+        (2.0, 2.0, 0.5), description="variance of x, y, z per squared metre of reach, per strain variance"
+    )
+    rotation_by_strain: tuple[float, float, float] = Field(
+        (0.7, 0.7, 8.0), description="variance of roll, pitch, yaw per strain variance"
+    )
 
 
 class Settings(_Frozen):
-    """Everything a run depends on; written beside every result."""
+    """Everything a run depends on; written beside every result.
 
-    map: MapSettings = MapSettings()
-    features: FeatureSettings = FeatureSettings()
-    match: MatchSettings = MatchSettings()
+    ``Settings(max_false_loops=0.1)`` is short for ``Settings(match={"max_false_loops": 0.1})``.
+    """
+
+    map: MapSettings = Field(MapSettings(), description="how a submap becomes a gradient map")
+    features: FeatureSettings = Field(FeatureSettings(), description="keypoints on the gradient map")
+    match: MatchSettings = Field(
+        MatchSettings(), description="how two maps are compared, and what makes a loop closure"
+    )
     skip_recent: int = Field(1, ge=0, description="submaps just before the query that are not compared")
-    seed: int = Field(0, ge=0, description="of every random draw")
+    seed: int = Field(0, ge=0, description="seed of the random number generator")
+    calibration: Calibration = Field(
+        Calibration(), description="measured constants, see docs/calibration.md; not meant to be changed"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_knob(cls, data: Any) -> Any:
+        """Accept `max_false_loops` at the top, where one looks for the one knob first."""
+        if not isinstance(data, dict) or "max_false_loops" not in data:
+            return data
+        rest = {name: value for name, value in data.items() if name != "max_false_loops"}
+        match = rest.get("match", {})
+        match = match.model_dump(exclude_unset=True) if isinstance(match, MatchSettings) else match
+        return rest | {"match": {**match, "max_false_loops": data["max_false_loops"]}}
+
+    def with_max_false_loops(self, allowed: float | None) -> "Settings":
+        """The same settings with another `max_false_loops`, or as they are if None.
+
+        Raises
+        ------
+        TerrainLoopError
+            If it is not a positive number.
+        """
+        if allowed is None:
+            return self
+        if not 0 < allowed < float("inf"):
+            raise TerrainLoopError(
+                expected="a positive max_false_loops, the expected number of false loops per mission",
+                found=f"{allowed}",
+                mend="give a number such as 0.01",
+            )
+        return self.model_copy(update={"match": self.match.model_copy(update={"max_false_loops": allowed})})
 
     @classmethod
     def preset(cls, name: str) -> "Settings":
@@ -149,9 +235,10 @@ def _yaml_lines(model: BaseModel, indent: str) -> list[str]:
     for name, field in type(model).model_fields.items():
         value = getattr(model, name)
         if isinstance(value, BaseModel):
-            lines += [f"{indent}{name}:  # {_line(type(value).__doc__)}", *_yaml_lines(value, indent + "  ")]
+            lines += [f"{indent}{name}:  # {field.description}", *_yaml_lines(value, indent + "  ")]
         else:
-            scalar = "null" if value is None else yaml.safe_dump(value).removesuffix("...\n").strip()
+            plain = list(value) if isinstance(value, tuple) else value
+            scalar = yaml.safe_dump(plain, default_flow_style=True).removesuffix("...\n").strip()
             lines.append(f"{indent}{name}: {scalar}  # {field.description}")
     return lines
 

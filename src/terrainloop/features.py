@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrainloop import _core
+from terrainloop.config import FeatureSettings
 from terrainloop.errors import TerrainLoopError
+from terrainloop.gradient_map import GradientMap
 
 # A map's contrast: the magnitude that all but its steepest hundredth stay below. Thresholds and grey
 # levels are relative to it, so that flat ground gives as many keypoints as rough ground does.
@@ -58,56 +60,34 @@ class Features:
         return len(self.positions)
 
 
-def extract_features(
-    magnitude: ArrayLike,
-    mask: ArrayLike,
-    *,
-    origin: ArrayLike,
-    resolution: float,
-    kind: str = "surf",
-    max_keypoints: int = 500,
-) -> Features:
-    """Keypoints of a gradient magnitude image where the mask is true, and their descriptors.
+def extract_features(gradient_map: GradientMap, settings: FeatureSettings) -> Features:
+    """Keypoints of a map's gradient magnitude within its observed area, and their descriptors.
 
-    The filters look beyond the mask; only the keypoints' centres are held within it.
+    The filters extend beyond the mask; only the keypoints' centres are restricted to it. SURF is our own (Bay
+    et al. 2008); SIFT (Lowe 2004) and ORB (Rublee et al. 2011) are OpenCV's.
 
     Parameters
     ----------
-    magnitude : array_like, (rows, cols)
-        Gradient magnitude; rows run along y, columns along x.
-    mask : array_like of bool, (rows, cols)
-        True where the map can be trusted.
-    origin : array_like, (2,)
-        Position (x, y) of pixel (0, 0), metres.
-    resolution : float
-        Side of a pixel, metres.
-    kind : {"surf", "sift", "orb"}
-        SURF is our own (Bay et al. 2008); SIFT (Lowe 2004) and ORB (Rublee et al. 2011) are OpenCV's.
-    max_keypoints : int
-        The strongest are kept; of equal ones those of smaller y, then x.
+    gradient_map : GradientMap
+    settings : FeatureSettings
+        Kind and number: the strongest are kept; of equal ones those of smaller y, then x.
 
     Raises
     ------
     TerrainLoopError
-        If the kind is unknown, or the arrays differ in shape or are not finite.
+        If the magnitude is not finite everywhere.
     """
-    image, allowed = _checked(magnitude, mask)
-    if kind not in _DETECTORS:
-        raise TerrainLoopError(
-            expected=f"a kind of features out of {', '.join(_DETECTORS)}",
-            found=repr(kind),
-            mend="name one of them",
-        )
+    image, allowed = _checked(gradient_map.magnitude, gradient_map.mask)
     contrast = float(np.percentile(image[allowed], CONTRAST_PERCENTILE)) if allowed.any() else 0.0
-    keypoints, descriptors = _DETECTORS[kind](image, allowed, contrast, max_keypoints)
+    keypoints, descriptors = _DETECTORS[settings.kind](image, allowed, contrast, settings.max_keypoints)
     return Features(
-        positions=np.asarray(origin, dtype=float) + resolution * keypoints[:, :2],
-        scales=resolution * keypoints[:, 2],
+        positions=np.array(gradient_map.origin) + gradient_map.resolution * keypoints[:, :2],
+        scales=gradient_map.resolution * keypoints[:, 2],
         # Rows run along +y, so the image's sense of rotation is the map's.
         orientations=keypoints[:, 3].copy(),
         responses=keypoints[:, 4].copy(),
         descriptors=descriptors,
-        kind=kind,
+        kind=settings.kind,
     )
 
 

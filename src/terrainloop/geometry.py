@@ -1,10 +1,16 @@
 """Rigid transforms as homogeneous matrices: SE(2) is (3, 3), SE(3) is (4, 4), float64.
 
 ``T_target_source`` takes points of the source frame into the target frame. Compose with ``@``.
+
+A tangent vector of SE(3) is (wx, wy, wz, vx, vy, vz), rotation first, and perturbs on the right, in the body
+frame: T exp(xi). That is GTSAM's convention (``Pose3::Expmap``); g2o files hold the translation first.
 """
+
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
@@ -51,6 +57,13 @@ def inverse(T: Array) -> Array:
     return result
 
 
+def translation(offset: ArrayLike) -> Array:
+    """SE(3) transform (4, 4) without rotation, from an offset (3,) in metres."""
+    T = np.eye(4)
+    T[:3, 3] = offset
+    return T
+
+
 def transform(T: Array, points: ArrayLike) -> Array:
     """Points (..., 2) or (..., 3) taken through an SE(2) or SE(3) transform."""
     return np.asarray(points, dtype=float) @ T[:-1, :-1].T + T[:-1, -1]
@@ -85,3 +98,80 @@ def fit_se2(source: ArrayLike, target: ArrayLike) -> Array:
     T[..., 1, 0], T[..., 1, 1], T[..., 1, 2] = turn.imag, turn.real, shift.imag
     T[..., 2, 2] = 1.0
     return T
+
+
+def exp_se3(tangent: ArrayLike) -> Array:
+    """Exponential map of SE(3): the transform (4, 4) of a tangent vector (6,), rotation first.
+
+    With w the rotation vector and t its length, the translation is V v, where
+    V = I + (1 - cos t) / t^2 [w] + (t - sin t) / t^3 [w]^2 (Barfoot 2017, eq. 7.37).
+    """
+    w, v = np.split(np.asarray(tangent, dtype=float), 2)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(w).as_matrix()
+    T[:3, 3] = _left_jacobian(w) @ v
+    return T
+
+
+def log_se3(T: Array) -> Array:
+    """Logarithm of an SE(3) transform: the tangent vector (6,) whose rotation is shorter than pi."""
+    w = Rotation.from_matrix(T[:3, :3]).as_rotvec()
+    return np.concatenate([w, np.linalg.solve(_left_jacobian(w), T[:3, 3])])
+
+
+def adjoint_se3(T: Array) -> Array:
+    """Adjoint (6, 6) of an SE(3) transform, rotation first: T exp(xi) = exp(Ad xi) T."""
+    R = T[:3, :3]
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = R
+    adjoint[3:, :3] = cross_matrix(T[:3, 3]) @ R
+    return adjoint
+
+
+def cross_matrix(vector: ArrayLike) -> Array:
+    """Matrix (3, 3) of the cross product with a vector (3,)."""
+    x, y, z = np.asarray(vector, dtype=float)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+TangentOrder = Literal["gtsam", "g2o"]
+
+
+def tangent_covariance(T: Array, covariance: Array, order: TangentOrder = "gtsam") -> Array:
+    """Covariance of a transform's parameters as that of its tangent vector.
+
+    Parameters
+    ----------
+    T : array, (4, 4)
+        SE(3), its pitch not +-90 degrees.
+    covariance : array, (6, 6)
+        Of (x, y, z, roll, pitch, yaw), the parameters of `T` (see `se3`), metres and radians.
+    order : {"gtsam", "g2o"}
+        Rotation first, as GTSAM's noise models have it, or translation first, as g2o files do.
+
+    Returns
+    -------
+    array, (6, 6)
+        Of the tangent vector xi in T exp(xi).
+    """
+    _, _, _, roll, pitch, _ = parameters_of(T)
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, 3:] = _body_rates(roll, pitch)
+    jacobian[3:, :3] = T[:3, :3].T
+    if order == "g2o":
+        jacobian = np.roll(jacobian, 3, axis=0)
+    return jacobian @ covariance @ jacobian.T
+
+
+def _body_rates(roll: float, pitch: float) -> Array:
+    """Angular velocity in the body frame (3,) by the rates of (roll, pitch, yaw), for Rz Ry Rx."""
+    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
+    return np.array([[1.0, 0.0, -sp], [0.0, cr, cp * sr], [0.0, -sr, cp * cr]])
+
+
+def _left_jacobian(w: Array) -> Array:
+    """V of `exp_se3`, by its series where the rotation is too small for the closed form."""
+    t, W = float(np.linalg.norm(w)), cross_matrix(w)
+    if t < 1e-4:
+        return np.eye(3) + W / 2 + W @ W / 6
+    return np.eye(3) + (1 - np.cos(t)) / t**2 * W + (t - np.sin(t)) / t**3 * W @ W

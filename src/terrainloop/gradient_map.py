@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.hyperparameters import FIT_POINTS
-from terrainloop.gp.kernel import Hyperparameters
+from terrainloop.gp.kernel import Array, Hyperparameters
 from terrainloop.gp.process import ElevationProcess, Solver, check_positive
 from terrainloop.gp.surface import Surface
 from terrainloop.submap import Submap
@@ -21,6 +21,7 @@ Image = NDArray[np.float32]
 
 PIXELS_PER_LENGTH_SCALE = 6  # keeps the field's interpolation error below its noise
 MAX_PIXELS = 20_000_000
+FAR = 10.0  # radii of the map, from which its frame's origin is no longer near it
 _BAD_ZIP = (zipfile.BadZipFile, zlib.error)
 
 
@@ -65,6 +66,12 @@ class GradientMap:
     def magnitude(self) -> Image:
         """Length of the gradient (I_g of the paper), dimensionless."""
         return np.hypot(self.gradient_x, self.gradient_y)
+
+    @property
+    def metres_from_pixels(self) -> Array:
+        """Affine map (3, 3) from (column, row) to metres."""
+        (x, y), r = self.origin, self.resolution
+        return np.array([[r, 0.0, x], [0.0, r, y], [0.0, 0.0, 1.0]])
 
     @classmethod
     def from_points(
@@ -155,13 +162,54 @@ class GradientMap:
             parameters=parameters,
         )
 
-    def save(self, path: Path | str) -> None:
-        """Write every array and number of the map to an ``.npz`` file."""
+    @property
+    def local_origin(self) -> Array:
+        """Point (3,) near the map that its loops' covariances refer to, metres.
+
+        It is zero, the origin of the submap's frame, unless that is more than `FAR` times the map's radius
+        away (UTM): there a rotation of a microradian moves the origin by metres, and a covariance of the
+        transform cannot be inverted. Then it is the middle of the map, in whole metres.
+        """
+        rows, columns = self.mask.shape
+        half = self.resolution * np.array([columns - 1, rows - 1]) / 2
+        height = float(np.median(self.elevation[self.mask])) if self.mask.any() else 0.0
+        middle = np.array([*(np.array(self.origin) + half), height])
+        return np.round(middle) if np.hypot(*middle[:2]) > FAR * np.hypot(*half) else np.zeros(3)
+
+    def to_bytes(self) -> bytes:
+        """The map as the bytes of an ``.npz`` file."""
         content = {field.name: getattr(self, field.name) for field in fields(self)}
         content |= {"magnitude": self.magnitude, "parameters": np.array(_values(self.parameters))}
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **content)
-        Path(path).write_bytes(buffer.getvalue())
+        return buffer.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> "GradientMap":
+        """The map that `to_bytes` wrote.
+
+        Raises
+        ------
+        TerrainLoopError
+            If the bytes are no such map.
+        """
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as file:
+                content = {field.name: file[field.name] for field in fields(cls)}
+            content["origin"] = tuple(content["origin"].tolist())
+            content["resolution"] = float(content["resolution"])
+            content["parameters"] = Hyperparameters(*content["parameters"].tolist())
+            return cls(**content)
+        except (ValueError, LookupError, EOFError, TypeError, AttributeError, OSError, *_BAD_ZIP) as error:
+            raise TerrainLoopError(
+                expected="a gradient map",
+                found=" ".join(str(error).split()),
+                mend="make one with 'terrainloop map CLOUD -o map.npz'",
+            ) from error
+
+    def save(self, path: Path | str) -> None:
+        """Write every array and number of the map to an ``.npz`` file."""
+        Path(path).write_bytes(self.to_bytes())
 
     @classmethod
     def load(cls, path: Path | str) -> "GradientMap":
@@ -173,16 +221,11 @@ class GradientMap:
             If the file is no such map.
         """
         try:
-            with np.load(io.BytesIO(Path(path).read_bytes()), allow_pickle=False) as file:
-                content = {field.name: file[field.name] for field in fields(cls)}
-            content["origin"] = tuple(content["origin"].tolist())
-            content["resolution"] = float(content["resolution"])
-            content["parameters"] = Hyperparameters(*content["parameters"].tolist())
-            return cls(**content)
-        except (OSError, ValueError, LookupError, EOFError, TypeError, AttributeError, *_BAD_ZIP) as error:
+            return cls.from_bytes(Path(path).read_bytes())
+        except (OSError, TerrainLoopError) as error:
             raise TerrainLoopError(
                 expected=f"a gradient map in {path}",
-                found=" ".join(str(error).split()),
+                found=getattr(error, "found", " ".join(str(error).split())),
                 mend="make one with 'terrainloop map CLOUD -o map.npz'",
             ) from error
 

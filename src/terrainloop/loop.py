@@ -1,9 +1,18 @@
 """What is known about one pair of submaps: the transform between them, the evidence, the decision."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+from terrainloop.geometry import TangentOrder, tangent_covariance, translation
+
+NO_EVIDENCE = -10.0
+"""Score of a pair for which no hypothesis could be weighed."""
+
+
+def _frame_origin() -> NDArray[np.float64]:
+    return np.zeros(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,8 +26,8 @@ class LoopCandidate:
     T_target_source : array, (4, 4)
         Takes points of source into the frame of target, metres.
     covariance : array, (6, 6)
-        Of (x, y, z, roll, pitch, yaw), the parameters of `T_target_source`, in metres and radians.
-        NaN where no transform could be estimated.
+        Of (x, y, z, roll, pitch, yaw), the parameters of `T_local`, in metres and radians. NaN where no
+        transform could be estimated. `information` converts it for GTSAM and g2o.
     inliers : int
         Associations that agree with the transform (n of Algorithm 1).
     ssd : float
@@ -26,11 +35,10 @@ class LoopCandidate:
     ssd_ratio : float
         `ssd` over what unrelated ground would give on the same overlap: 0 identical, 1 unrelated.
     overlap : float
-        Shared part of the two maps' known ground, intersection over union, 0 to 1.
+        Intersection over union of the two maps' observed areas at this transform, 0 to 1.
     score : float
-        Higher is surer; comparable across pairs. By evidence: minus the decimal logarithm of the false
-        alarms that one pair would yield by chance. By inliers: these, discounted by the share of the
-        gradients that they leave unexplained, n (1 - ssd_ratio).
+        Higher is surer; comparable across the pairs of a run. ``-log_nfa`` where a run decides by evidence
+        (`NO_EVIDENCE` where no hypothesis could be weighed), `inlier_score` where it decides by inliers.
     accepted : bool
     reason : str
         In words, why it was accepted or not.
@@ -38,6 +46,14 @@ class LoopCandidate:
         What proposed the pose: the search of all poses, or the keypoints.
     correlation : float
         Of the two gradient fields over the shared ground, -1 to 1; NaN where it was not computed.
+    log_nfa : float
+        Decimal logarithm of the number of false alarms (NFA): how many matches at least as good a pair of
+        unrelated submaps yields by chance. NaN where the run decides by inliers.
+    inlier_score : float
+        Inliers, discounted by the share of the gradients that they leave unexplained, n (1 - ssd_ratio).
+    source_origin, target_origin : array, (3,)
+        Points of the two frames, metres, that `T_local` and the covariance refer to: zero, or a point near
+        the submap where its frame's origin is far away (UTM).
     """
 
     source: str
@@ -53,9 +69,15 @@ class LoopCandidate:
     reason: str
     found_by: str = ""
     correlation: float = np.nan
+    log_nfa: float = np.nan
+    inlier_score: float = np.nan
+    source_origin: NDArray[np.float64] = field(default_factory=_frame_origin)
+    target_origin: NDArray[np.float64] = field(default_factory=_frame_origin)
 
     @classmethod
-    def without_transform(cls, source: str, target: str, reason: str, score: float = 0.0) -> "LoopCandidate":
+    def without_transform(
+        cls, source: str, target: str, reason: str, score: float = NO_EVIDENCE
+    ) -> "LoopCandidate":
         """A pair that was rejected before a transform could be estimated."""
         return cls(
             source=source,
@@ -73,3 +95,30 @@ class LoopCandidate:
 
     def __bool__(self) -> bool:
         return self.accepted
+
+    @property
+    def T_local(self) -> NDArray[np.float64]:
+        """`T_target_source` (4, 4) between the frames moved to `source_origin` and `target_origin`.
+
+        It takes (points of source - source_origin) to (points of target - target_origin). Where the origins
+        are zero, it is `T_target_source` itself.
+        """
+        return translation(-self.target_origin) @ self.T_target_source @ translation(self.source_origin)
+
+    def information(self, order: TangentOrder = "gtsam") -> NDArray[np.float64]:
+        """Information matrix (6, 6) of the tangent vector xi in T_local exp(xi).
+
+        Parameters
+        ----------
+        order : {"gtsam", "g2o"}
+            Rotation first, for ``gtsam.noiseModel.Gaussian.Information`` of a ``BetweenFactorPose3`` that
+            joins target to source and measures `T_local`; or translation first, as in g2o files.
+
+        Returns
+        -------
+        array, (6, 6)
+            NaN where there is no covariance.
+        """
+        covariance = tangent_covariance(self.T_local, self.covariance, order)
+        unknown = np.isnan(covariance).any()
+        return np.full((6, 6), np.nan) if unknown else np.asarray(np.linalg.inv(covariance), dtype=float)

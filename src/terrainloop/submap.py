@@ -12,6 +12,9 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
+UNNAMED = "submap"
+"""Name of a submap that was given none."""
+
 MIN_POINTS = 100
 """A 10 x 10 grid: fewer points cannot hold the handful of keypoints that one loop closure needs."""
 
@@ -51,7 +54,7 @@ class Submap:
     """
 
     points: Array
-    name: str = "submap"
+    name: str = UNNAMED
     session: str = ""
     stamp: float = 0.0
     intensity: Array | None = None

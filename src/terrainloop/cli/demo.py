@@ -1,19 +1,26 @@
-"""``terrainloop demo``: simulate a mission, detect its loops, hold them against the truth."""
+"""``terrainloop demo``: simulate a mission, detect its loops, compare them with the ground truth."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
-from terrainloop.cli import detect, match
-from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose, WorkersOption
+from terrainloop.cli import detect
+from terrainloop.cli.terminal import (
+    AllowedOption,
+    Json,
+    Quiet,
+    Terminal,
+    Verbose,
+    WorkersOption,
+    worker_count,
+)
 
 if TYPE_CHECKING:
-    from terrainloop.detection.detector import LoopDetector
+    from terrainloop.detection.run import Run
     from terrainloop.io.missions import Mission
-    from terrainloop.io.results import SubmapRecord
+    from terrainloop.loop import LoopCandidate
 
 
 def command(
@@ -23,6 +30,7 @@ def command(
     world: Annotated[str, typer.Option("--world", help="etna, morocco, mars, flat or ripples.")] = "etna",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed, another place.")] = 0,
     submaps: Annotated[int, typer.Option("--submaps", min=3, help="How many; 16 have loops.")] = 16,
+    max_false_loops: AllowedOption = None,
     workers: WorkersOption = 0,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -30,11 +38,13 @@ def command(
 ) -> None:
     """Simulate a rover mission, find its loop closures, print the table, draw the pictures."""
     from terrainloop.config import Settings
+    from terrainloop.detection.mission import detect_mission
     from terrainloop.evaluation.judge import judge
     from terrainloop.io.missions import load_mission
     from terrainloop.simulation.missions import simulate_mission, write_mission
 
     terminal = Terminal.open(as_json, quiet, verbose)
+    settings = Settings().with_max_false_loops(max_false_loops)
     folder = output / "mission"
     folder.mkdir(parents=True, exist_ok=True)
     with terminal.progress() as progress:
@@ -42,45 +52,45 @@ def command(
             world, seed, submaps, progress=lambda done, total: progress("simulated", done, total)
         )
     write_mission(simulated, folder)
-    mission, settings = load_mission(folder), Settings()
-    detector, records = detect.run_detection(mission, settings, output, workers, terminal)
-    pairs = judge(detector.candidates, records, simulated.truth)
-    pictures = _draw(output, mission, detector, records)
-    summary = detect.summarise(detector.candidates, records) | {
+    mission = load_mission(folder)
+    with terminal.progress() as progress:
+        run = detect_mission(
+            mission, settings, output=output, workers=worker_count(workers), on_progress=progress
+        )
+    candidates = list(run.pairs())
+    pairs = judge(candidates, run.submaps, simulated.truth)
+    pictures = _draw(output, mission, run, max(candidates, key=lambda candidate: candidate.score))
+    summary = detect.summarise(run) | {
         "false_loops": sum(not pair.pose_is_right for pair in pairs if pair.candidate),
         "true_pairs": sum(pair.overlap > 0.3 for pair in pairs),
         "true_pairs_found": sum(pair.overlap > 0.3 for pair in pairs if pair.candidate),
-        "output": str(output),
         "pictures": [str(picture) for picture in pictures],
     }
 
     def show(console: Console) -> None:
-        detect.show(console, detector, records, output)
+        detect.show(console, run)
         console.print(
-            f"Against the truth: {summary['true_pairs_found']} of {summary['true_pairs']} pairs that share "
-            f"over 30 % of their ground found, {summary['false_loops']} false loops."
+            f"Against the ground truth: {summary['true_pairs_found']} of {summary['true_pairs']} pairs that "
+            f"share over 30 % of their ground found, {summary['false_loops']} false loops."
         )
-        console.print("Pictures: " + ", ".join(summary["pictures"]))
+        console.print("Pictures: " + ", ".join(summary["pictures"]), markup=False)
 
     terminal.result(summary, show)
 
 
-def _draw(
-    output: Path, mission: "Mission", detector: "LoopDetector", records: Sequence["SubmapRecord"]
-) -> list[Path]:
+def _draw(output: Path, mission: "Mission", run: "Run", best: "LoopCandidate") -> list[Path]:
     """The mission with its loops, one gradient map, and the surest match."""
-    from terrainloop.report.figures import figure_map, figure_mission, save_figure
+    from terrainloop.report.figures import figure_map, figure_match, figure_mission, save_figure
 
     assert mission.truth is not None
-    loops = [candidate for candidate in detector.candidates if candidate]
-    best = max(detector.candidates, key=lambda candidate: candidate.score)
-    source, target = detector.submaps[best.source], detector.submaps[best.target]
-    pictures = [output / "mission.png", output / "map.png", output / "match.png"]
-    hulls = [record.hull for record in records]
-    title = f"{len(loops)} loop closures, submaps at their true poses"
-    figure = figure_mission(mission.names, mission.truth.poses, hulls, loops, title=title)
-    save_figure(figure, pictures[0])
-    submap = mission.read(mission.names.index(best.source))
-    save_figure(figure_map(submap, source.gradient_map), pictures[1])
-    match.draw(source, target, best, detector.settings, pictures[2])
-    return pictures
+    source, target = run.entries[best.source], run.entries[best.target]
+    hulls = [record.hull for record in run.submaps]
+    title = f"{len(run.loops)} loop closures, submaps at their true poses"
+    figures = {
+        "mission.png": figure_mission(mission.names, mission.truth.poses, hulls, run.loops, title=title),
+        "map.png": figure_map(mission.read(mission.names.index(best.source)), source.gradient_map),
+        "match.png": figure_match(source, target, best, run.settings),
+    }
+    for name, figure in figures.items():
+        save_figure(figure, output / name)
+    return [output / name for name in figures]

@@ -1,7 +1,5 @@
 """``terrainloop detect``: the loops of a mission."""
 
-from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,6 +8,7 @@ import typer
 from rich.console import Console
 
 from terrainloop.cli.terminal import (
+    AllowedOption,
     ConfigOption,
     Json,
     PresetOption,
@@ -25,19 +24,17 @@ from terrainloop.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from terrainloop.config import Settings
-    from terrainloop.detection.detector import LoopDetector
-    from terrainloop.io.missions import Mission
-    from terrainloop.io.results import SubmapRecord
+    from terrainloop.detection.run import Run
     from terrainloop.loop import LoopCandidate
 
 
 def command(
-    mission: Annotated[Path, typer.Argument(help="Folder of clouds, one submap a file, in metres.")],
+    mission: Annotated[Path, typer.Argument(help="Folder of clouds, one submap per file, in metres.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")],
     all_pairs: Annotated[
         bool, typer.Option("--all-pairs", help="Compare consecutive submaps too, for evaluation.")
     ] = False,
+    max_false_loops: AllowedOption = None,
     preset: PresetOption = "default",
     config: ConfigOption = None,
     seed: SeedOption = None,
@@ -49,102 +46,77 @@ def command(
     """Find the loop closures among the submaps of a mission.
 
     Writes loops.csv (accepted), pairs.csv (every pair compared, with the reason), submaps.csv (every
-    cloud, with repairs and errors) and config.yaml (the settings as run).
+    cloud, with repairs and errors), run.json (what was fitted) and config.yaml (the settings as run).
     """
-    from terrainloop.io.missions import load_mission
+    from terrainloop.detection.mission import detect_mission
 
     terminal = Terminal.open(as_json, quiet, verbose)
-    settings = read_settings(preset, config, seed)
+    settings = read_settings(preset, config, seed, max_false_loops)
     if all_pairs:
         settings = settings.model_copy(update={"skip_recent": 0})
-    detector, records = run_detection(load_mission(mission), settings, output, workers, terminal)
-    summary = summarise(detector.candidates, records)
-    terminal.result(
-        summary | {"output": str(output)}, lambda console: show(console, detector, records, output)
-    )
-
-
-def run_detection(
-    mission: "Mission", settings: "Settings", output: Path, workers: int, terminal: Terminal
-) -> tuple["LoopDetector", list["SubmapRecord"]]:
-    """Detect with progress bars and write the results."""
-    from terrainloop.detection.mission import detect_mission
-    from terrainloop.io.results import write_loops, write_submaps
-
-    output.mkdir(parents=True, exist_ok=True)
     with terminal.progress() as progress:
-        detector, records = detect_mission(
-            mission, settings, workers=worker_count(workers), on_progress=progress
+        run = detect_mission(
+            mission, settings, output=output, workers=worker_count(workers), on_progress=progress
         )
-    (output / "config.yaml").write_text(settings.to_yaml(), encoding="utf-8")
-    write_submaps(output / "submaps.csv", records)
-    write_loops(output / "pairs.csv", detector.candidates)
-    write_loops(output / "loops.csv", [candidate for candidate in detector.candidates if candidate])
-    return detector, records
+    terminal.result(summarise(run), lambda console: show(console, run))
 
 
-def summarise(candidates: Sequence["LoopCandidate"], records: Sequence["SubmapRecord"]) -> dict[str, Any]:
+def summarise(run: "Run") -> dict[str, Any]:
     """The run in numbers, for JSON."""
-    from terrainloop.geometry import parameters_of
+    from dataclasses import asdict
 
+    from terrainloop.io.results import loop_to_dict
+
+    usable = [record for record in run.submaps if record.status == "ok"]
     return {
-        "submaps": sum(record.status == "ok" for record in records),
-        "broken": {record.name: record.notes for record in records if record.status == "broken"},
-        "repaired": {r.name: r.notes for r in records if r.status == "ok" and r.notes},
-        "pairs": len(candidates),
-        "loops": [
-            {
-                "source": loop.source,
-                "target": loop.target,
-                "transform": dict(
-                    zip(
-                        ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad"),
-                        parameters_of(loop.T_target_source).tolist(),
-                        strict=True,
-                    )
-                ),
-                "inliers": loop.inliers,
-                "ssd_ratio": loop.ssd_ratio,
-                "overlap": loop.overlap,
-                "score": loop.score,
-                "found_by": loop.found_by,
-                "correlation": loop.correlation,
-                "reason": loop.reason,
-            }
-            for loop in candidates
-            if loop
-        ],
+        "submaps": len(usable),
+        "broken": {record.name: record.notes for record in run.submaps if record.status == "broken"},
+        "repaired": {record.name: record.notes for record in usable if record.notes},
+        "hyperparameters": None if run.parameters is None else asdict(run.parameters),
+        "pairs": run.num_pairs,
+        "complete": run.complete,
+        "rejections": dict(run.rejections),
+        "loops": [loop_to_dict(loop) for loop in run.loops],
+        "output": str(run.folder),
     }
 
 
-def show(console: Console, detector: "LoopDetector", records: Sequence["SubmapRecord"], output: Path) -> None:
+def show(console: Console, run: "Run") -> None:
     """The run as a table and a few sentences."""
-    loops = [candidate for candidate in detector.candidates if candidate]
     columns = ("source", "target", "x, m", "y, m", "z, m", "yaw", "+/- m", "score", "shared")
-    console.print(table_of("Loop closures", columns, [_row(loop) for loop in loops]))
-    usable = sum(record.status == "ok" for record in records)
+    if run.loops:
+        console.print(table_of("Loop closures", columns, [_row(loop) for loop in run.loops]))
+    usable = [record for record in run.submaps if record.status == "ok"]
     console.print(
-        f"\n{count_of(len(loops), 'loop closure')} in {count_of(len(detector.candidates), 'pair')} "
-        f"of {count_of(usable, 'submap')}. "
-        "The transform takes points of source into the frame of target; yaw in degrees."
+        f"\n{count_of(len(run.loops), 'loop closure')} in {count_of(run.num_pairs, 'pair')} "
+        f"of {count_of(len(usable), 'submap')}."
     )
-    for count, kind in rejections(detector.candidates):
-        console.print(f"  {count_of(count, 'pair')} rejected: {kind}")
-    for record in records:
+    if run.loops:
+        console.print("The transform takes points of source into the frame of target; yaw in degrees.")
+    if run.num_pairs == 0:
+        console.print(
+            f"No pair was compared: the {count_of(run.settings.skip_recent, 'submap')} just before each is "
+            "skipped. Use --all-pairs to compare them too, or 'terrainloop match A B' for two clouds."
+        )
+    if run.parameters is not None:
+        p = run.parameters
+        console.print(
+            f"Fitted: length scale {p.length_scale:.3g} m, relief {p.variance**0.5:.3g} m, "
+            f"noise {p.noise:.2g} m."
+        )
+    for kind, count in run.rejections.items():
+        console.print(f"  {count_of(count, 'pair')} rejected: {kind}", markup=False)
+    for record in run.submaps:
         if record.status == "broken":
-            console.print(f"  left out {record.name}: {record.notes}")
-    repaired = sum(record.status == "ok" and bool(record.notes) for record in records)
+            console.print(f"  left out {record.name}: {record.notes}", markup=False)
+    repaired = sum(bool(record.notes) for record in usable)
     if repaired:
         console.print(f"  {count_of(repaired, 'submap')} repaired on the way in: see notes in submaps.csv")
     console.print(
-        f"Written to {output}: loops.csv, pairs.csv (why each was rejected), submaps.csv, config.yaml"
+        f"Written to {run.folder}: loops.csv, pairs.csv (why each was rejected), submaps.csv, config.yaml, "
+        "run.json",
+        markup=False,
     )
-
-
-def rejections(candidates: Sequence["LoopCandidate"]) -> list[tuple[int, str]]:
-    """How many pairs were rejected for which kind of reason, most frequent first."""
-    kinds = Counter(candidate.reason.partition(":")[0] for candidate in candidates if not candidate)
-    return [(count, kind) for kind, count in kinds.most_common()]
 
 
 def _row(loop: "LoopCandidate") -> list[str]:

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from terrainloop.evaluation.judge import JudgedPair, Reading
     from terrainloop.evaluation.precision_recall import Metrics, OperatingPoint
     from terrainloop.geometry import Array
-    from terrainloop.io.results import SubmapRecord
     from terrainloop.loop import LoopCandidate
+    from terrainloop.record import SubmapRecord
 
     Judged = JudgedPair[LoopCandidate]
 
@@ -66,7 +66,7 @@ def command(
     from terrainloop.io.trajectories import read_trajectory
 
     terminal = Terminal.open(as_json, quiet, verbose)
-    candidates, records = read_loops(run / "pairs.csv"), read_submaps(run / "submaps.csv")
+    candidates, records = list(read_loops(run / "pairs.csv")), read_submaps(run / "submaps.csv")
     poses = read_trajectory(truth).poses
     pairs = judge(
         candidates,

@@ -23,14 +23,22 @@ if TYPE_CHECKING:
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else, on stdout.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more about what is done.")]
+Verbose = Annotated[
+    bool, typer.Option("--verbose", "-v", help="Verbose output: what is fitted and decided on the way.")
+]
 PresetOption = Annotated[str, typer.Option("--preset", help="default, or paper: the pipeline as published.")]
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", help="YAML settings, see 'terrainloop config'. Excludes --preset.")
 ]
-SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Of every random draw.")]
+SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of the random number generator.")]
+AllowedOption = Annotated[
+    float | None,
+    typer.Option(
+        "--max-false-loops", help="Expected number of false loop closures per mission [default: 0.01]."
+    ),
+]
 WorkersOption = Annotated[
-    int, typer.Option("--workers", min=0, help="Parallel workers; 0: one a core. Results do not change.")
+    int, typer.Option("--workers", min=0, help="Parallel workers; 0: one per core. Results do not change.")
 ]
 
 
@@ -96,7 +104,9 @@ def table_of(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) 
     return table
 
 
-def read_settings(preset: str, config: Path | None, seed: int | None) -> "Settings":
+def read_settings(
+    preset: str, config: Path | None, seed: int | None, max_false_loops: float | None = None
+) -> "Settings":
     """Settings from the options that every detecting command has."""
     from terrainloop.config import Settings
 
@@ -105,11 +115,24 @@ def read_settings(preset: str, config: Path | None, seed: int | None) -> "Settin
             expected="either --preset or --config", found="both", mend="put the preset's changes in the file"
         )
     settings = Settings.from_yaml(config) if config is not None else Settings.preset(preset)
+    settings = settings.with_max_false_loops(max_false_loops)
     return settings if seed is None else settings.model_copy(update={"seed": seed})
 
 
+def check_output(path: Path, suffixes: Sequence[str]) -> None:
+    """Refuse an output that could not be written, before the work is done."""
+    if path.suffix.lower() not in suffixes:
+        raise TerrainLoopError(
+            expected=f"an output that ends in {' or '.join(suffixes)}", found=str(path), mend="rename it"
+        )
+    if not path.parent.is_dir():
+        raise TerrainLoopError(
+            expected=f"a folder for {path.name}", found=f"no folder {path.parent}", mend="make it first"
+        )
+
+
 def worker_count(workers: int) -> int:
-    """As asked for, or one a core."""
+    """As asked for, or one per core."""
     if workers:
         return workers
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,18 +1,24 @@
 """LoopDetector: submaps go in one by one, loop closures come out."""
 
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from threading import Lock
+
+import numpy as np
 
 from terrainloop.config import Settings
+from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
+from terrainloop.geometry import Array
 from terrainloop.gp.hyperparameters import fit_hyperparameters
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
-from terrainloop.matching.mapped import MappedSubmap
-from terrainloop.matching.register import compare
-from terrainloop.submap import Submap
+from terrainloop.matching.register import compare_many
+from terrainloop.record import SubmapRecord
+from terrainloop.submap import UNNAMED, Submap
+
+PairSink = Callable[[LoopCandidate], object]
 
 
 class LoopDetector:
@@ -21,20 +27,25 @@ class LoopDetector:
     Parameters
     ----------
     settings : Settings, optional
+    max_false_loops : float, optional
+        Expected number of false loop closures per mission; in place of that of the settings.
     parameters : Hyperparameters, optional
         Of the Gaussian process, where they are known; else fitted as ``settings.map.fit`` says.
     expected_pairs : int, optional
-        That the mission will compare, where it is known: `max_false_loops` is shared out among them.
-        Else each query is given less of it than the one before, so that it holds for any number.
+        Number of pairs that the mission will compare, where it is known: `max_false_loops` is shared among
+        them. Otherwise each query is given less of it than the one before, so that it holds for any number.
+    on_pair : callable, optional
+        Called with every LoopCandidate as it is decided, rejected ones too; the detector keeps the loops
+        only.
     workers : int
-        Threads; the result does not depend on it.
+        Threads; the result does not depend on their number.
 
     Attributes
     ----------
-    submaps : dict of str to MappedSubmap
-        The database, by name, in the order of arrival.
-    candidates : list of LoopCandidate
-        Every pair that was compared.
+    entries : dict of str to MapEntry
+        The submaps stored so far, by id, in the order of arrival.
+    loops : list of LoopCandidate
+        The accepted loops so far.
 
     Examples
     --------
@@ -48,64 +59,86 @@ class LoopDetector:
         self,
         settings: Settings | None = None,
         *,
+        max_false_loops: float | None = None,
         parameters: Hyperparameters | None = None,
         expected_pairs: int | None = None,
+        on_pair: PairSink = lambda candidate: None,
         workers: int = 1,
     ) -> None:
-        self.settings = settings or Settings()
+        if settings is not None and not isinstance(settings, Settings):
+            raise TerrainLoopError(
+                expected="settings",
+                found=repr(settings),
+                mend="pass Settings(), Settings.preset('paper') or Settings.from_yaml(path)",
+            )
+        self.settings = (settings or Settings()).with_max_false_loops(max_false_loops)
         self.parameters = parameters
         self.expected_pairs = expected_pairs
         self.workers = workers
-        self.submaps: dict[str, MappedSubmap] = {}
-        self.candidates: list[LoopCandidate] = []
+        self.entries: dict[str, MapEntry] = {}
+        self.loops: list[LoopCandidate] = []
+        self._on_pair = on_pair
+        self._adding = Lock()
 
     def add(self, submap: Submap) -> list[LoopCandidate]:
         """Map a submap, compare it with the earlier ones, store it.
 
+        Safe to call from several threads: submaps are added one after the other.
+
         Parameters
         ----------
         submap : Submap
-            Named unlike any before.
+            With a name that is not taken; one without a name is given its number.
 
         Returns
         -------
         list of LoopCandidate
-            The accepted loops; `candidates` holds the rejected pairs too.
+            The accepted loops.
 
         Raises
         ------
         TerrainLoopError
-            If the name is taken or no map can be made; the database is then as it was.
+            If the name is taken or no map can be made; the detector is then as it was.
         """
-        self._check_name(submap.name)
-        parameters = self.parameters
-        if parameters is None and self.settings.map.fit == "database":
-            parameters = fit_database([submap], self.settings, workers=self.workers)
-        query = map_submap(submap, self.settings, parameters, workers=self.workers)
-        self.parameters = parameters
-        return self.add_mapped(query)
+        if not isinstance(submap, Submap):
+            raise TerrainLoopError(
+                expected="a Submap", found=f"a {type(submap).__name__}", mend="pass Submap(points, name=...)"
+            )
+        with self._adding:
+            parameters = self.parameters
+            if parameters is None and self.settings.map.fit == "database":
+                parameters = fit_database([submap], self.settings, workers=self.workers)
+            query = map_submap(submap, self.settings, parameters, workers=self.workers)
+            if submap.name == UNNAMED:
+                name = f"{UNNAMED}_{len(self.entries):06d}"
+                query = replace(query, record=replace(query.record, name=name))
+            loops = self._add(query)
+            self.parameters = parameters
+            return loops
 
-    def add_mapped(self, query: MappedSubmap) -> list[LoopCandidate]:
+    def add_entry(self, query: MapEntry) -> list[LoopCandidate]:
         """As `add`, for a submap that is mapped already (see `map_submap`)."""
-        self._check_name(query.name)
-        stored = list(self.submaps.values())[: max(0, len(self.submaps) - self.settings.skip_recent)]
+        with self._adding:
+            return self._add(query)
+
+    def _add(self, query: MapEntry) -> list[LoopCandidate]:
+        if query.id in self.entries:
+            raise TerrainLoopError(
+                expected="a submap with a name of its own",
+                found=f"a second {query.id!r}",
+                mend="name each submap differently",
+            )
+        stored = list(self.entries.values())[: max(0, len(self.entries) - self.settings.skip_recent)]
         # A mission may go on for ever: its k-th query, which finds k stored, may spend 1 / (k (k + 1)) of
         # `max_false_loops`, all queries together 1.
         pairs = self.expected_pairs or len(stored) ** 2 * (len(stored) + 1)
-        work = partial(compare, query, settings=self.settings, pairs=pairs)
-        with ThreadPoolExecutor(self.workers) as pool:
-            candidates = list(pool.map(work, stored))
-        self.submaps[query.name] = query
-        self.candidates += candidates
-        return [candidate for candidate in candidates if candidate]
-
-    def _check_name(self, name: str) -> None:
-        if name in self.submaps:
-            raise TerrainLoopError(
-                expected="a submap with a name of its own",
-                found=f"a second {name!r}",
-                mend="name each submap differently",
-            )
+        candidates = compare_many(query, stored, self.settings, pairs=pairs, workers=self.workers)
+        self.entries[query.id] = query
+        for candidate in candidates:
+            self._on_pair(candidate)
+        loops = [candidate for candidate in candidates if candidate]
+        self.loops += loops
+        return loops
 
 
 def fit_database(submaps: Sequence[Submap], settings: Settings, *, workers: int = 1) -> Hyperparameters:
@@ -124,9 +157,14 @@ def fit_database(submaps: Sequence[Submap], settings: Settings, *, workers: int 
 
 
 def map_submap(
-    submap: Submap, settings: Settings, parameters: Hyperparameters | None = None, *, workers: int = 1
-) -> MappedSubmap:
-    """The gradient map of a submap and its keypoints.
+    submap: Submap,
+    settings: Settings,
+    parameters: Hyperparameters | None = None,
+    *,
+    odometry: Array | None = None,
+    workers: int = 1,
+) -> MapEntry:
+    """The gradient map of a submap, its keypoints and its field.
 
     Parameters
     ----------
@@ -134,8 +172,10 @@ def map_submap(
     settings : Settings
     parameters : Hyperparameters, optional
         Of the database; without them they are fitted to this submap.
+    odometry : array, (4, 4), optional
+        T_world_submap by odometry.
     workers : int
-        Threads; the result does not depend on it.
+        Threads; the result does not depend on their number.
     """
     parameters = parameters or fit_database([submap], settings, workers=workers)
     gradient_map = GradientMap.from_points(
@@ -152,4 +192,18 @@ def map_submap(
         seed=settings.seed,
         workers=workers,
     )
-    return MappedSubmap.of(submap.name, gradient_map, settings)
+    odometry = None if odometry is None else np.array(odometry, dtype=float)
+    return MapEntry.of(SubmapRecord.of(submap, odometry), gradient_map, settings)
+
+
+def map_pair(
+    source: Submap, target: Submap, settings: Settings, *, workers: int = 1
+) -> tuple[MapEntry, MapEntry]:
+    """Two submaps at rest with the same hyperparameters, so that they can be compared."""
+    shared = None
+    if settings.map.fit == "database":
+        shared = fit_database([source, target], settings, workers=workers)
+    return (
+        map_submap(source, settings, shared, workers=workers),
+        map_submap(target, settings, shared, workers=workers),
+    )

@@ -2,85 +2,136 @@
 
 import logging
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
+from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from terrainloop.config import Settings
-from terrainloop.detection.detector import LoopDetector, fit_database, map_submap
+from terrainloop.detection.detector import LoopDetector, PairSink, fit_database, map_submap
+from terrainloop.detection.run import Run, RunWriter
+from terrainloop.detection.workers import map_in_processes
+from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.kernel import Hyperparameters
-from terrainloop.io.missions import Mission
-from terrainloop.io.results import SubmapRecord, submap_record
-from terrainloop.matching.mapped import MappedSubmap
+from terrainloop.io.missions import Mission, load_mission
+from terrainloop.loop import LoopCandidate
+from terrainloop.record import SubmapRecord
 from terrainloop.submap import Submap
 
-FITTED_SUBMAPS = 3  # the database's hyperparameters are fitted on, spread over the mission
+logger = logging.getLogger(__name__)
+
+FITTED_SUBMAPS = 3  # spread over the mission, that the hyperparameters of its database are fitted on
+
+Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
 class MappedCloud:
-    """A cloud of the mission: its record and, unless it is broken, its map."""
+    """A cloud of the mission: its record and, unless it is broken, the submap at rest."""
 
     record: SubmapRecord
-    mapped: MappedSubmap | None
+    entry: MapEntry | None
 
 
 def detect_mission(
-    mission: Mission,
-    settings: Settings,
+    mission: Mission | Path | str,
+    settings: Settings | None = None,
     *,
+    output: Path | str | None = None,
+    on_pair: PairSink = lambda candidate: None,
     workers: int = 1,
-    on_progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
-) -> tuple[LoopDetector, list[SubmapRecord]]:
-    """Run the detector over a mission, leaving out clouds that are broken.
+    on_progress: Progress = lambda stage, done, total: None,
+) -> Run:
+    """Find the loop closures of a mission, leaving out clouds that are broken.
+
+    An interrupt (Ctrl-C) ends the comparison of pairs early; what was found by then is returned and written,
+    with ``run.complete`` false.
 
     Parameters
     ----------
-    mission : Mission
-    settings : Settings
+    mission : Mission or path
+        The mission, or its folder.
+    settings : Settings, optional
+    output : path, optional
+        Folder for the results (see `Run.read`), written whole or not at all.
+    on_pair : callable
+        Called with every LoopCandidate as it is decided, rejected ones too.
     workers : int
-        Processes for the maps, threads for the pairs; the result does not depend on it.
+        Processes for the maps, threads for the pairs; the result does not depend on their number.
     on_progress : callable
-        Told (stage, done, total) as the work goes on.
+        Called with (stage, done, total) as the work goes on.
 
     Returns
     -------
-    detector : LoopDetector
-        With every pair in ``.candidates``.
-    records : list of SubmapRecord
-        One for every cloud, broken ones too.
+    Run
+        With its pairs only where an output is given.
 
     Raises
     ------
     TerrainLoopError
-        If no cloud can be used.
+        If no cloud can be used, or the output cannot be written.
     """
+    settings = settings or Settings()
+    mission = mission if isinstance(mission, Mission) else load_mission(mission)
+    if output is None:
+        return _detect(mission, settings, on_pair, workers, on_progress)
+    with RunWriter(Path(output)) as writer:
+
+        def keep(candidate: LoopCandidate) -> None:
+            writer.add(candidate)
+            on_pair(candidate)
+
+        return writer.finish(_detect(mission, settings, keep, workers, on_progress))
+
+
+def _detect(
+    mission: Mission, settings: Settings, on_pair: PairSink, workers: int, on_progress: Progress
+) -> Run:
     parameters = _fit_mission(mission, settings, workers) if settings.map.fit == "database" else None
     clouds: list[MappedCloud] = []
     for cloud in _map_clouds(mission, settings, parameters, workers):
         clouds.append(cloud)
         on_progress("maps", len(clouds), len(mission))
-    usable = [cloud.mapped for cloud in clouds if cloud.mapped is not None]
-    if not usable:
+    entries = [cloud.entry for cloud in clouds if cloud.entry is not None]
+    if not entries:
         raise TerrainLoopError(
             expected=f"at least one usable cloud in {mission.path}",
             found=f"{len(clouds)} broken, the first: {clouds[0].record.notes}",
-            mend="mend the clouds or name another folder",
+            mend="correct the clouds or name another folder",
         )
-    compared = max(0, len(usable) - settings.skip_recent)
-    expected_pairs = compared * (compared - 1) // 2
-    detector = LoopDetector(settings, parameters=parameters, expected_pairs=expected_pairs, workers=workers)
-    with threadpool_limits(1, user_api="blas"):
-        for done, mapped in enumerate(usable, start=1):
-            detector.add_mapped(mapped)
-            on_progress("pairs", done, len(usable))
-    return detector, [cloud.record for cloud in clouds]
+    compared = max(0, len(entries) - settings.skip_recent)
+    detector = LoopDetector(
+        settings,
+        parameters=parameters,
+        expected_pairs=compared * (compared - 1) // 2,
+        on_pair=on_pair,
+        workers=workers,
+    )
+    complete = True
+    try:
+        with threadpool_limits(1, user_api="blas"):
+            for done, entry in enumerate(entries, start=1):
+                detector.add_entry(entry)
+                on_progress("pairs", done, len(entries))
+    except KeyboardInterrupt:
+        logger.warning(
+            "interrupted after %d of %d submaps: only the pairs compared by then are in the result",
+            len(detector.entries),
+            len(entries),
+        )
+        complete = False
+    return Run(
+        settings=settings,
+        parameters=parameters,
+        submaps=tuple(cloud.record for cloud in clouds),
+        loops=tuple(detector.loops),
+        entries=detector.entries,
+        complete=complete,
+    )
 
 
 def _fit_mission(mission: Mission, settings: Settings, workers: int) -> Hyperparameters | None:
@@ -91,35 +142,48 @@ def _fit_mission(mission: Mission, settings: Settings, workers: int) -> Hyperpar
         if len(submaps) < FITTED_SUBMAPS:
             with suppress(TerrainLoopError):
                 submaps.append(mission.read(index))
-    return fit_database(submaps, settings, workers=workers) if submaps else None
+    if not submaps:
+        return None
+    parameters = fit_database(submaps, settings, workers=workers)
+    logger.info(
+        "fitted on %s: length scale %.3g m, relief %.3g m, noise %.3g m",
+        ", ".join(submap.name for submap in submaps),
+        parameters.length_scale,
+        parameters.variance**0.5,
+        parameters.noise,
+    )
+    return parameters
 
 
 def _map_clouds(
     mission: Mission, settings: Settings, parameters: Hyperparameters | None, workers: int
 ) -> Iterator[MappedCloud]:
     """Every cloud of the mission in order, mapped in as many processes as there are workers."""
-    work = partial(_map_cloud, mission, settings, parameters)
-    if workers == 1:
-        with threadpool_limits(1, user_api="blas"):
-            yield from map(work, range(len(mission)))
-        return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_start_worker) as pool:
-        yield from pool.map(work, range(len(mission)))
-
-
-def _start_worker() -> None:
-    """One BLAS thread a process; what would be logged is in the records."""
-    threadpool_limits(1, user_api="blas")
-    logging.disable()
+    task = partial(_map_cloud, mission, settings, parameters)
+    return map_in_processes(task, len(mission), workers, partial(_killed, mission))
 
 
 def _map_cloud(
     mission: Mission, settings: Settings, parameters: Hyperparameters | None, index: int
 ) -> MappedCloud:
+    """A cloud and its map; whatever is wrong with it, the mission goes on without it."""
     try:
         submap = mission.read(index)
-        return MappedCloud(submap_record(submap), map_submap(submap, settings, parameters))
+        odometry = None if mission.odometry is None else mission.odometry.poses[index]
+        entry = map_submap(submap, settings, parameters, odometry=odometry)
+        return MappedCloud(entry.record, entry)
     except TerrainLoopError as error:
-        return MappedCloud(
-            SubmapRecord(mission.names[index], float(index), 0, "broken", notes=str(error)), None
-        )
+        return _broken(mission, index, str(error))
+    except MemoryError:
+        return _broken(mission, index, "not enough memory for its map: use fewer workers, or cut the cloud")
+    except Exception as error:  # not even a fault of ours may end a mission of hours
+        return _broken(mission, index, f"a fault of terrainloop, please report it: {error!r}")
+
+
+def _killed(mission: Mission, index: int) -> MappedCloud:
+    return _broken(mission, index, "the process that mapped it was killed, most likely for lack of memory")
+
+
+def _broken(mission: Mission, index: int, notes: str) -> MappedCloud:
+    stamp = mission.stamp(index)
+    return MappedCloud(SubmapRecord(mission.names[index], stamp, 0, "broken", notes=notes), None)

@@ -11,7 +11,7 @@ from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.overlap import box_iou, world_boxes
 from terrainloop.evaluation.precision_recall import Metrics, OperatingPoint, measure, precision_recall
 from terrainloop.geometry import Array, inverse, yaw_of
-from terrainloop.io.results import SubmapRecord
+from terrainloop.record import SubmapRecord
 
 POSITION_TOLERANCE = 1.0  # metres within which a pose closes the right loop
 YAW_TOLERANCE = float(np.deg2rad(5.0))

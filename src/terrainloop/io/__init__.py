@@ -3,10 +3,8 @@
 from terrainloop.io.clouds import CLOUD_SUFFIXES, read_cloud, write_cloud
 from terrainloop.io.missions import Mission, load_mission
 from terrainloop.io.results import (
-    SubmapRecord,
     read_loops,
     read_submaps,
-    submap_record,
     write_loops,
     write_submaps,
 )
@@ -15,14 +13,12 @@ from terrainloop.io.trajectories import Trajectory, read_trajectory, write_tum
 __all__ = [
     "CLOUD_SUFFIXES",
     "Mission",
-    "SubmapRecord",
     "Trajectory",
     "load_mission",
     "read_cloud",
     "read_loops",
     "read_submaps",
     "read_trajectory",
-    "submap_record",
     "write_cloud",
     "write_loops",
     "write_submaps",

@@ -44,16 +44,20 @@ class Mission:
         """Names of all submaps, also of those that cannot be read."""
         return tuple(file.stem for file in self.files)
 
+    def stamp(self, index: int) -> float:
+        """Stamp of a submap by the odometry, else the truth, else its index."""
+        trajectory = self.odometry or self.truth
+        return float(trajectory.stamps[index] if trajectory else index)
+
     def read(self, index: int) -> Submap:
-        """The submap of one file, stamped by the odometry, else the truth, else its index.
+        """The submap of one file.
 
         Raises
         ------
         TerrainLoopError
             Where that file is broken.
         """
-        trajectory = self.odometry or self.truth
-        return read_cloud(self.files[index], float(trajectory.stamps[index] if trajectory else index))
+        return read_cloud(self.files[index], self.stamp(index))
 
     def __iter__(self) -> Iterator[Submap]:
         broken = 0

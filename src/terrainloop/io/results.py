@@ -3,88 +3,90 @@
 import csv
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import parameters_of, se3
 from terrainloop.loop import LoopCandidate
-from terrainloop.submap import Submap
-
-
-@dataclass(frozen=True, eq=False)
-class SubmapRecord:
-    """One line of `submaps.csv`.
-
-    Attributes
-    ----------
-    name : str
-    stamp : float
-    points : int
-        That were used, 0 where broken.
-    status : {"ok", "broken"}
-    hull : array, (M, 2)
-        Corners, anticlockwise, of the convex hull of x and y in the submap's own frame, metres, rounded to
-        millimetres; none where broken.
-    notes : str
-        Repairs, or what is wrong.
-    """
-
-    name: str
-    stamp: float
-    points: int
-    status: Literal["ok", "broken"]
-    hull: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
-    notes: str = ""
-
-
-def submap_record(submap: Submap) -> SubmapRecord:
-    """What `submaps.csv` keeps of a submap."""
-    xy = submap.points[:, :2]
-    corners = xy[ConvexHull(xy - xy[0]).vertices]
-    hull = np.round(corners, 3) + 0.0  # no negative zeros
-    return SubmapRecord(submap.name, submap.stamp, len(submap), "ok", hull, "; ".join(submap.repairs))
+from terrainloop.record import SubmapRecord
 
 
 def write_submaps(path: str | Path, records: Iterable[SubmapRecord]) -> None:
-    """Write `submaps.csv`: one line a submap, whole or not at all; the hull as WKT."""
-    rows = ([r.name, r.stamp, r.points, r.status, r.hull, r.notes] for r in records)
+    """Write `submaps.csv`: one line per submap, whole or not at all; the hull as WKT."""
+    rows = ([r.name, r.stamp, r.points, r.status, r.hull, r.notes, r.session] for r in records)
     _write_table(Path(path), _SUBMAP_COLUMNS, rows)
 
 
 def read_submaps(path: str | Path) -> list[SubmapRecord]:
     """Read what `write_submaps` wrote; raises `TerrainLoopError` naming file, line and column."""
-    rows = _read_table(Path(path), _SUBMAP_COLUMNS)
+    rows = _read_table(Path(path), _SUBMAP_COLUMNS, _SUBMAP_ADDED)
     return [SubmapRecord(hull=row.pop("hull_m"), **row) for row in rows]
 
 
-def write_loops(path: str | Path, candidates: Iterable[LoopCandidate]) -> None:
-    """Write `loops.csv` or `pairs.csv`: one line a candidate, every digit kept, whole or not at all.
+class LoopFile:
+    """`loops.csv` or `pairs.csv` in the making: one line per candidate, every digit kept.
 
-    The transform is T_target_source as x, y, z (metres), roll, pitch, yaw (radians; Rz Ry Rx); its
-    covariance is the upper triangle, row by row. Columns are only ever added, at the end.
+    The transform is T_target_source as x, y, z (metres), roll, pitch, yaw (radians; Rz Ry Rx). The covariance
+    is the upper triangle, row by row, of the parameters of the transform between the two local origins, which
+    are zero unless a frame's origin is far from its submap. Columns are only ever added, at the end.
     """
-    rows = (
-        [
-            *(c.source, c.target, *parameters_of(c.T_target_source)),
-            *(c.inliers, c.ssd, c.overlap, c.score, c.accepted, c.reason),
-            *c.covariance[_UPPER],
-            *(c.ssd_ratio, c.found_by, c.correlation),
-        ]
-        for c in candidates
-    )
-    _write_table(Path(path), _LOOP_COLUMNS, rows)
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("w", encoding="utf-8", newline="")
+        self._writer = csv.writer(self._file, lineterminator="\n")
+        self._writer.writerow(_LOOP_COLUMNS)
+
+    def write(self, candidate: LoopCandidate) -> None:
+        """Add a candidate."""
+        self._writer.writerow(_written(_LOOP_COLUMNS, _loop_row(candidate)))
+
+    def close(self) -> None:
+        """Finish the file; nothing is done if it is finished already."""
+        self._file.close()
 
 
-def read_loops(path: str | Path) -> list[LoopCandidate]:
-    """Read what `write_loops` wrote; raises `TerrainLoopError` naming file, line and column."""
-    return [_candidate(row) for row in _read_table(Path(path), _LOOP_COLUMNS)]
+def write_loops(path: str | Path, candidates: Iterable[LoopCandidate]) -> None:
+    """Write `loops.csv` or `pairs.csv` (see `LoopFile`), whole or not at all."""
+    _write_table(Path(path), _LOOP_COLUMNS, map(_loop_row, candidates))
+
+
+def read_loops(path: str | Path) -> Iterator[LoopCandidate]:
+    """Read what `write_loops` wrote, line by line.
+
+    Raises
+    ------
+    TerrainLoopError
+        Naming file, line and column.
+    """
+    return map(_candidate, _read_table(Path(path), _LOOP_COLUMNS, _LOOP_ADDED))
+
+
+def loop_to_dict(candidate: LoopCandidate) -> dict[str, Any]:
+    """A candidate for JSON, with the parameters of its transform beside the matrix."""
+    parameters = parameters_of(candidate.T_target_source).tolist()
+    values = {f.name: getattr(candidate, f.name) for f in fields(candidate)}
+    plain = {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
+    return plain | {
+        "transform": dict(
+            zip(("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad"), parameters, strict=True)
+        )
+    }
+
+
+def _loop_row(c: LoopCandidate) -> list[Any]:
+    return [
+        *(c.source, c.target, *parameters_of(c.T_target_source)),
+        *(c.inliers, c.ssd, c.overlap, c.score, c.accepted, c.reason),
+        *c.covariance[_UPPER],
+        *(c.ssd_ratio, c.found_by, c.correlation, c.log_nfa, c.inlier_score),
+        *(*c.source_origin, *c.target_origin),
+    ]
 
 
 def _candidate(row: dict[str, Any]) -> LoopCandidate:
@@ -92,6 +94,9 @@ def _candidate(row: dict[str, Any]) -> LoopCandidate:
     covariance = np.empty((6, 6))
     covariance[_UPPER] = [row.pop(name) for name in _COVARIANCE_COLUMNS]
     covariance.T[_UPPER] = covariance[_UPPER]
+    for end in ("source", "target"):
+        origin = [row.pop(f"{end}_origin_{axis}_m", 0.0) for axis in "xyz"]
+        row[f"{end}_origin"] = np.array(origin)
     return LoopCandidate(T_target_source=T_target_source, covariance=covariance, **row)
 
 
@@ -146,6 +151,15 @@ _LOOP_COLUMNS: dict[str, Kind] = {
     "found_by": _TEXT,
     "correlation": _NUMBER,
 }
+_LOOP_ADDED: dict[str, Kind] = dict.fromkeys(
+    [
+        "log_nfa",
+        "inlier_score",
+        *(f"{end}_origin_{axis}_m" for end in ("source", "target") for axis in "xyz"),
+    ],
+    _NUMBER,
+)
+_LOOP_COLUMNS |= _LOOP_ADDED
 _SUBMAP_COLUMNS: dict[str, Kind] = {
     "name": _TEXT,
     "stamp": _NUMBER,
@@ -154,6 +168,8 @@ _SUBMAP_COLUMNS: dict[str, Kind] = {
     "hull_m": _POLYGON,
     "notes": _TEXT,
 }
+_SUBMAP_ADDED: dict[str, Kind] = {"session": _TEXT}
+_SUBMAP_COLUMNS |= _SUBMAP_ADDED
 
 
 def write_whole(path: Path, write: Callable[[TextIO], object]) -> None:
@@ -167,34 +183,46 @@ def write_whole(path: Path, write: Callable[[TextIO], object]) -> None:
         aside.unlink(missing_ok=True)
 
 
+def _written(columns: dict[str, Kind], row: Sequence[Any]) -> list[str]:
+    return [write(value) for (write, _), value in zip(columns.values(), row, strict=True)]
+
+
 def _write_table(path: Path, columns: dict[str, Kind], rows: Iterable[Sequence[Any]]) -> None:
     def write(file: TextIO) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
-        for row in rows:
-            writer.writerow([written(v) for (written, _), v in zip(columns.values(), row, strict=True)])
+        writer.writerows(_written(columns, row) for row in rows)
 
     write_whole(path, write)
 
 
-def _read_table(path: Path, columns: dict[str, Kind]) -> list[dict[str, Any]]:
-    """Rows by column name; columns that were added behind these by others are passed over."""
+def _read_table(path: Path, columns: dict[str, Kind], added: Collection[str]) -> Iterator[dict[str, Any]]:
+    """Rows by column name; the `added` columns may be missing, and those after all of these are ignored."""
     try:
         with path.open(encoding="utf-8", newline="") as file:
             reader = csv.reader(file, strict=True)
-            lines = [(reader.line_num, cells) for cells in reader if cells]
+            header = next(reader, [])
+            known = _known_columns(path, header, columns, added)
+            for cells in reader:
+                if cells:
+                    yield _parse_row(path, reader.line_num, known, cells)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise TerrainLoopError(
             expected="a CSV file", found=f"{path}: {error}", mend="give a file that terrainloop wrote"
         ) from error
-    header = lines[0][1] if lines else []
-    if header[: len(columns)] != list(columns):
+
+
+def _known_columns(
+    path: Path, header: list[str], columns: dict[str, Kind], added: Collection[str]
+) -> dict[str, Kind]:
+    known = dict(list(columns.items())[: len(header)])
+    if header[: len(known)] != list(known) or len(known) < len(columns) - len(added):
         raise TerrainLoopError(
             expected=f"the columns {','.join(columns)}",
             found=f"{','.join(header) or 'none'} in {path}, line 1",
             mend="give a file that terrainloop wrote",
         )
-    return [_parse_row(path, number, columns, cells) for number, cells in lines[1:]]
+    return known
 
 
 def _parse_row(path: Path, number: int, columns: dict[str, Kind], cells: list[str]) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""Matching: whether two gradient maps show the same place, and how they lie."""
+"""Matching: whether two gradient maps show the same place, and the transform between them."""

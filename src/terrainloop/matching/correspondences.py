@@ -11,7 +11,7 @@ from terrainloop.geometry import Array
 
 @dataclass(frozen=True, eq=False)
 class Associations:
-    """The set A of the paper: row i of `source` and of `target` may be the same spot of ground.
+    """The set A of the paper: row i of `source` and of `target` may be the same point of the ground.
 
     Both are (A, 2), metres, each in the frame of its own map.
     """
@@ -36,7 +36,7 @@ def associate(source: Features, target: Features) -> Associations:
     norm = cv2.NORM_HAMMING if source.descriptors.dtype == np.uint8 else cv2.NORM_L2
     matches = cv2.BFMatcher(norm, crossCheck=True).match(source.descriptors, target.descriptors)
     pairs = np.array([(m.queryIdx, m.trainIdx) for m in matches], dtype=int).reshape(-1, 2)
-    # A keypoint with two orientations stands twice in the features; it is one spot of ground.
+    # A keypoint with two orientations is listed twice; it counts once.
     ends = np.hstack([source.positions[pairs[:, 0]], target.positions[pairs[:, 1]]])
     _, first = np.unique(ends, axis=0, return_index=True)
     ends = ends[np.sort(first)]

@@ -1,4 +1,4 @@
-"""Algorithm 1 of the paper: RANSAC on SE(2) over keypoint associations, verified on the maps."""
+"""The fast form of Algorithm 1: RANSAC on SE(2) over keypoint associations, verified on the maps."""
 
 import zlib
 from collections.abc import Iterator
@@ -13,10 +13,11 @@ from terrainloop.config import Settings
 from terrainloop.geometry import Array, fit_se2
 from terrainloop.gradient_map import GradientMap
 from terrainloop.matching.correspondences import Associations
+from terrainloop.matching.overlay import Overlay
 from terrainloop.matching.ssd import Ssd, compute_ssd
 
-CHUNK = 32  # inlier sets looked at together: few are asked for
-MAX_VERIFIED = 200  # inlier sets whose h is computed, which bounds the time of a pair
+CHUNK = 32  # inlier sets that are made at a time: few are asked for
+MAX_VERIFIED = 200  # largest inlier sets whose h is computed, which bounds the time of a pair
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +39,7 @@ def register_by_ransac(
     max_ssd_ratio: float,
     rng: np.random.Generator,
 ) -> Alignment | None:
-    """Algorithm 1: the accepted transform that most associations agree with.
+    """The result of `algorithm_1.algorithm_1`: the accepted transform with the most inliers.
 
     The loop of the paper keeps, over all draws, the transform with the most inliers among those
     whose SSD is acceptable. Here draws are visited by falling inlier count, so that the first
@@ -51,9 +52,9 @@ def register_by_ransac(
     associations : Associations
         The set A.
     iterations : int
-        Pairs of associations drawn.
+        Number of draws of two associations.
     inlier_radius : float
-        Metres.
+        Largest distance of an inlier, metres.
     max_ssd_ratio : float
         Largest `Ssd.ratio` of an acceptable transform.
     rng : numpy.random.Generator
@@ -64,15 +65,15 @@ def register_by_ransac(
     Alignment or None
         None if no draw has two inliers; if none is acceptable, the first draw with most inliers.
     """
-    # Samples half a length scale apart hold what neighbouring pixels repeat: enough to discard by.
+    # Neighbouring pixels are redundant: samples half a length scale apart are enough to discard a draw.
     step = max(1, int(target.parameters.length_scale / 2 / target.resolution))
     best = None
     proposed = propose(associations, iterations=iterations, inlier_radius=inlier_radius, rng=rng)
     for inliers in islice(proposed, MAX_VERIFIED):
         T_i = fit_se2(associations.source[inliers], associations.target[inliers])
-        hopeful = compute_ssd(source, target, T_i, step).ratio <= max_ssd_ratio
-        if hopeful or best is None:
-            alignment = Alignment(T_i, inliers, compute_ssd(source, target, T_i))
+        promising = compute_ssd(Overlay(source, target, T_i, step)).ratio <= max_ssd_ratio
+        if promising or best is None:
+            alignment = Alignment(T_i, inliers, compute_ssd(Overlay(source, target, T_i)))
             if alignment.ssd.ratio <= max_ssd_ratio:
                 return alignment
             best = best or alignment
@@ -82,7 +83,7 @@ def register_by_ransac(
 def propose(
     associations: Associations, *, iterations: int, inlier_radius: float, rng: np.random.Generator
 ) -> Iterator[NDArray[np.bool_]]:
-    """Inlier sets of random draws, the largest first, none of them twice, none of one.
+    """Distinct inlier sets of random draws, the largest first, each of two associations or more.
 
     Parameters
     ----------
@@ -93,7 +94,7 @@ def propose(
         return
     draws = select_random_associations(len(associations), iterations, rng)
     apart = np.linalg.norm(associations.source[draws[:, 0]] - associations.source[draws[:, 1]], axis=1)
-    draws = draws[apart > inlier_radius]  # closer than their own error, two points tell no rotation
+    draws = draws[apart > inlier_radius]  # closer ones do not constrain the rotation
     T = fit_se2(associations.source[draws], associations.target[draws])
     yield from _distinct_by_falling_count(associations, T, inlier_radius)
 
@@ -103,8 +104,8 @@ def inlier_radius_of(settings: Settings, target: GradientMap) -> float:
     return settings.match.inlier_radius or target.parameters.length_scale / 2
 
 
-def draws_of(settings: Settings, *names: str) -> np.random.Generator:
-    """The draws that belong to a pair of submaps, whatever was compared before."""
+def rng_for_pair(settings: Settings, *names: str) -> np.random.Generator:
+    """The random generator of a pair of submaps, the same whatever was compared before."""
     return np.random.default_rng([settings.seed, *(zlib.crc32(name.encode()) for name in names)])
 
 
@@ -128,7 +129,7 @@ def get_inliers(associations: Associations, T: Array, inlier_radius: float) -> N
 def _distinct_by_falling_count(
     associations: Associations, T: Array, inlier_radius: float
 ) -> Iterator[NDArray[np.bool_]]:
-    """Inlier sets of two or more, largest first, in the order of the draws, none of them twice."""
+    """Distinct inlier sets of two or more, the largest first, equal ones in the order of the draws."""
     motions = np.stack([T[:, 0, 0], T[:, 1, 0], T[:, 0, 2], T[:, 1, 2]], axis=1)
     counts = _core.inlier_counts(associations.source, associations.target, motions, inlier_radius)
     order = np.argsort(-counts, kind="stable")

@@ -1,4 +1,4 @@
-"""The pose at which two gradient maps agree best over the ground they share, by Gauss-Newton."""
+"""Refinement: the pose at which two gradient maps agree best over their overlap, by Gauss-Newton."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,82 +7,103 @@ from typing import Any
 import numpy as np
 
 from terrainloop import _core
+from terrainloop.config import Calibration
 from terrainloop.geometry import Array, se2
 from terrainloop.gradient_map import GradientMap
 from terrainloop.matching.covariance import block_covariance
 
-PLACES_PER_LENGTH_SCALE = 3  # what lies between them, neighbours repeat
-USUAL_STRAIN = 0.004  # of a submap, standard deviation; what is assumed before the pair is seen,
-USUAL_STRAIN_SAMPLES = 3.0  # and how many samples that assumption is worth
+SAMPLES_PER_LENGTH_SCALE = 3  # denser samples are redundant
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How far a refinement goes.
+
+    Attributes
+    ----------
+    samples : int
+        Maximum number of sample points.
+    steps : int
+        Maximum number of Gauss-Newton steps.
+    tolerance : float
+        RMS motion of the ground at which it has converged, in length scales.
+    """
+
+    samples: int
+    steps: int
+    tolerance: float
+
+
+THOROUGH = Effort(samples=20_000, steps=10, tolerance=1e-3)
+ROUGH = Effort(samples=2000, steps=3, tolerance=0.02)
+"""Enough to rank hypotheses (docs/matching.md, section 2)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """A pose settled on the gradients, linearised there.
+    """A refined pose, linearised there.
 
     Attributes
     ----------
     T_target_source : array, (3, 3)
         SE(2).
     pivot : array, (2,)
-        Middle of the shared ground in the target frame, metres.
-    ground : array, (N, 2)
-        Places looked at, in the target frame, metres.
+        Centroid of the sample points in the target frame, metres.
+    positions : array, (N, 2)
+        Sample points in the target frame, metres.
     residual, weights : array, (2, N)
         Of the two components of the gradient.
     motion : array, (2, N, 5)
-        Jacobian of (x, y, turn about the pivot, difference in slope along x and along y).
+        Jacobian of the residual by x, y, yaw about the pivot, and the difference in slope along x and y.
     strain : array, (2, N, 3)
-        Jacobian of the strain along x, along y, and across.
+        Jacobian of the residual by the strain (non-rigid deformation) along x, along y, and the shear.
     length_scale : float
         Metres.
+    calibration : Calibration
     """
 
     T_target_source: Array
     pivot: Array
-    ground: Array
+    positions: Array
     residual: Array
     weights: Array
     motion: Array
     strain: Array
     length_scale: float
+    calibration: Calibration
 
     @cached_property
     def covariance(self) -> Array:
-        """(3, 3) of (x, y, yaw) about the pivot, metres and radians: what noise leaves open to rigid maps."""
+        """(3, 3) of (x, y, yaw) about the pivot, metres and radians, if the submaps are rigid."""
         return self._fit(self.motion)[1][:3, :3]
 
     @cached_property
     def strain_variance(self) -> float:
-        """How far a submap is from rigid: variance of its strain, dimensionless.
+        """Variance of the strain of one submap, dimensionless: how far it is from rigid.
 
-        From the strain of one submap against the other, less its noise, and what is usual. Along x and
-        along y it has twice the variance of one submap's, across once.
+        From the strain between the two submaps, less its noise, and a prior. The strain along x and along y
+        has twice the variance of one submap's, the shear once.
         """
         strain, covariance = self._fit(np.concatenate([self.motion, self.strain], axis=-1))
         samples = (strain[5:] ** 2 - np.diag(covariance)[5:]) / (2.0, 2.0, 1.0)
+        prior, weight = self.calibration.usual_strain**2, self.calibration.usual_strain_samples
         if np.isnan(samples).any():
-            return USUAL_STRAIN**2
-        seen = max(float(samples.sum()), 0.0)
-        return (USUAL_STRAIN_SAMPLES * USUAL_STRAIN**2 + seen) / (USUAL_STRAIN_SAMPLES + len(samples))
+            return prior
+        observed = max(float(samples.sum()), 0.0)
+        return (weight * prior + observed) / (weight + len(samples))
 
     def weakest(self, distance: float) -> tuple[Array, Array]:
-        """The two poses (3, 3) a distance in metres away, in the direction that the gradients tell least."""
-        radius = self._radius
+        """The two poses (3, 3) at a distance in metres along the direction that is constrained least."""
+        radius = float(np.sqrt(((self.positions - self.pivot) ** 2).sum(axis=1).mean()))
         _, normal = self._solve(self.motion / (1.0, 1.0, radius, 1.0, 1.0))
         slopes = np.linalg.solve(normal[3:, 3:], normal[3:, :3])
-        x, y, turn = np.linalg.eigh(normal[:3, :3] - normal[:3, 3:] @ slopes)[1][:, 0]
-        away = distance * np.array([x, y, turn / radius])
+        x, y, yaw = np.linalg.eigh(normal[:3, :3] - normal[:3, 3:] @ slopes)[1][:, 0]
+        away = distance * np.array([x, y, yaw / radius])
         return self._move(*away) @ self.T_target_source, self._move(*-away) @ self.T_target_source
 
-    @property
-    def _radius(self) -> float:
-        """Root mean square distance of the ground from the pivot, metres."""
-        return float(np.sqrt(((self.ground - self.pivot) ** 2).sum(axis=1).mean()))
-
-    def _move(self, dx: float, dy: float, turn: float) -> Array:
-        """The motion (3, 3) in the target frame by a turn about the pivot and a shift."""
-        move = se2(0.0, 0.0, turn)
+    def _move(self, dx: float, dy: float, yaw: float) -> Array:
+        """The motion (3, 3) in the target frame by a rotation about the pivot and a shift."""
+        move = se2(0.0, 0.0, yaw)
         move[:2, 2] = self.pivot - move[:2, :2] @ self.pivot + (dx, dy)
         return move
 
@@ -97,55 +118,51 @@ class Refinement:
     def _fit(self, jacobian: Array) -> tuple[Array, Array]:
         """Least-squares parameters (P,) and their covariance (P, P)."""
         parameters, normal = self._solve(jacobian)
-        left = self.weights * (self.residual + jacobian @ parameters)
-        return parameters, block_covariance(jacobian, left, normal, self.ground, self.length_scale)
+        remaining = self.weights * (self.residual + jacobian @ parameters)
+        block = self.calibration.block * self.length_scale
+        return parameters, block_covariance(jacobian, remaining, normal, self.positions, block)
 
 
 def refine(
     source: GradientMap,
     target: GradientMap,
     T_target_source: Array,
-    *,
-    places: int = 20_000,
-    steps: int = 10,
-    tolerance: float = 1e-3,
+    calibration: Calibration,
+    effort: Effort = THOROUGH,
 ) -> Refinement | None:
-    """Minimise the weighted differences of the gradient vectors, from an alignment near the best.
+    """Minimise the weighted differences of the gradient vectors, from an alignment near the optimum.
 
-    With R, T the rotation and transform sought, the residual at a place x of the target is
+    With R, T the rotation and transform sought, the residual at a sample point x of the target is
 
         r(x) = g_target(x) - R g_source(T^-1 x) - c
 
     with c one difference in slope for the whole map (a tilt between the frames). Its weight is the
-    inverse of the two gradient variances' sum, times Cauchy's.
+    inverse of the sum of the two gradient variances, times Cauchy's.
 
     Parameters
     ----------
     source, target : GradientMap
     T_target_source : array, (3, 3)
         SE(2), off by less than about half a length scale.
-    places : int
-        Looked at, at most.
-    steps : int
-        Of Gauss-Newton, at most.
-    tolerance : float
-        Motion below which it has settled, in length scales over the map.
+    calibration : Calibration
+    effort : Effort
 
     Returns
     -------
     Refinement or None
         None where the maps share too little ground.
     """
-    settled = _core.settle(
+    length_scale = target.parameters.length_scale
+    refined = _core.settle(
         _gradients_of(source),
         _gradients_of(target),
         T_target_source,
-        step=max(1, round(target.parameters.length_scale / PLACES_PER_LENGTH_SCALE / target.resolution)),
-        places=places,
-        steps=steps,
-        tolerance=tolerance * target.parameters.length_scale,
+        step=max(1, round(length_scale / SAMPLES_PER_LENGTH_SCALE / target.resolution)),
+        places=effort.samples,
+        steps=effort.steps,
+        tolerance=effort.tolerance * length_scale,
     )
-    return None if settled is None else Refinement(*settled, length_scale=target.parameters.length_scale)
+    return None if refined is None else Refinement(*refined, length_scale, calibration)
 
 
 def _gradients_of(gradient_map: GradientMap) -> tuple[Any, ...]:

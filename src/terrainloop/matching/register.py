@@ -1,11 +1,18 @@
-"""The one entry to matching: whether two submaps show the same place, and how they lie."""
+"""The one entry to matching: whether submaps show the same place, and the transform between them."""
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 from terrainloop.config import Settings
+from terrainloop.entry import MapEntry
+from terrainloop.errors import TerrainLoopError
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
-from terrainloop.matching.by_evidence import compare_by_evidence
 from terrainloop.matching.by_inliers import compare_by_inliers
-from terrainloop.matching.mapped import MappedSubmap
+from terrainloop.matching.decision import compare_by_evidence
+from terrainloop.matching.query import Query, RotatedField, rotate, search_grid
+from terrainloop.record import SubmapRecord
 
 
 def register(
@@ -28,27 +35,78 @@ def register(
     -------
     LoopCandidate
         Falsy if rejected; ``.reason`` says why.
+
+    Raises
+    ------
+    TerrainLoopError
+        If one of the two is not a gradient map.
     """
     settings = settings or Settings()
+    for given in (source_map, target_map):
+        if not isinstance(given, GradientMap):
+            raise TerrainLoopError(
+                expected="two gradient maps",
+                found=f"a {type(given).__name__}",
+                mend="make maps with GradientMap.from_points, of both clouds with one length scale",
+            )
     source, target = (
-        MappedSubmap.of(name, gradient_map, settings)
+        MapEntry.of(SubmapRecord(name), gradient_map, settings)
         for name, gradient_map in zip(names, (source_map, target_map), strict=True)
     )
     return compare(source, target, settings)
 
 
-def compare(
-    source: MappedSubmap, target: MappedSubmap, settings: Settings, *, pairs: float = 1
-) -> LoopCandidate:
-    """As `register`, for submaps that are ready to be compared.
+def compare(source: MapEntry, target: MapEntry, settings: Settings, *, pairs: float = 1) -> LoopCandidate:
+    """As `register`, for submaps at rest; the parameters are those of `compare_many`."""
+    return compare_many(source, [target], settings, pairs=pairs)[0]
+
+
+def compare_many(
+    source: MapEntry,
+    targets: Sequence[MapEntry],
+    settings: Settings,
+    *,
+    pairs: float = 1,
+    workers: int = 1,
+) -> list[LoopCandidate]:
+    """Compare one submap with several.
 
     Parameters
     ----------
-    source, target : MappedSubmap
+    source : MapEntry
+        The query.
+    targets : sequence of MapEntry
     settings : Settings
     pairs : float
-        Compared in the mission; its `max_false_loops` is for all of them.
+        Number of pairs compared in the run; `max_false_loops` is for all of them.
+    workers : int
+        Threads; the result does not depend on their number.
+
+    Returns
+    -------
+    list of LoopCandidate
+        In the order of the targets.
     """
-    if settings.match.decision == "inliers":
-        return compare_by_inliers(source, target, settings)
-    return compare_by_evidence(source, target, settings, pairs)
+    with ThreadPoolExecutor(workers) as pool:
+        if settings.match.decision == "inliers":
+            return list(pool.map(partial(compare_by_inliers, source, settings=settings), targets))
+        candidates: dict[int, LoopCandidate] = {}
+        for query, indices in _queries(source, targets, settings):
+            work = partial(compare_by_evidence, query, settings=settings, pairs=pairs)
+            found = pool.map(work, [targets[index] for index in indices])
+            candidates |= zip(indices, found, strict=True)
+    return [candidates[index] for index in range(len(targets))]
+
+
+def _queries(
+    source: MapEntry, targets: Sequence[MapEntry], settings: Settings
+) -> Iterator[tuple[Query, list[int]]]:
+    """The source as a query for each search grid, with the indices of the targets searched on that grid."""
+    grids = [search_grid(source, target, settings) for target in targets]
+    rotated: dict[float, RotatedField] = {}
+    for grid in sorted(set(grids), key=lambda grid: (grid.spacing, grid.size)):
+        if grid.spacing not in rotated:
+            field = source.field_at(grid.spacing, settings)
+            rotated = {grid.spacing: rotate(field, settings.calibration)}
+        query = Query.of(source, grid, rotated[grid.spacing])
+        yield query, [index for index, of in enumerate(grids) if of == grid]

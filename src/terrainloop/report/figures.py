@@ -11,13 +11,16 @@ from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch
 from numpy.typing import NDArray
 
+from terrainloop.config import Settings
+from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.precision_recall import OperatingPoint
-from terrainloop.geometry import Array, transform
+from terrainloop.geometry import Array, se2, transform, yaw_of
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
-from terrainloop.matching.correspondences import Associations
-from terrainloop.matching.ssd import shared_ground, warp
+from terrainloop.matching.correspondences import Associations, associate
+from terrainloop.matching.overlay import Overlay
+from terrainloop.matching.ransac import get_inliers, inlier_radius_of
 from terrainloop.submap import Submap
 
 SOURCE_COLOUR, TARGET_COLOUR = "#d1495b", "#00798c"
@@ -56,14 +59,12 @@ def figure_map(submap: Submap, gradient_map: GradientMap) -> Figure:
     return figure
 
 
-def figure_match(
-    source_map: GradientMap,
-    target_map: GradientMap,
-    candidate: LoopCandidate,
-    associations: Associations,
-    inliers: NDArray[np.bool_],
-) -> Figure:
+def figure_match(source: MapEntry, target: MapEntry, candidate: LoopCandidate, settings: Settings) -> Figure:
     """Two maps, their associations, and the maps laid over each other (paper, Fig. 4)."""
+    source_map, target_map = source.gradient_map, target.gradient_map
+    associations = associate(source.features, target.features)
+    T = _planar(candidate.T_target_source)
+    inliers = get_inliers(associations, T[None], inlier_radius_of(settings, target_map))[0]
     figure = Figure(figsize=(13, 11), layout="constrained")
     verdict = "loop closure" if candidate else "no loop closure"
     figure.suptitle(f"{candidate.source} to {candidate.target}: {verdict} ({candidate.reason})")
@@ -76,9 +77,9 @@ def figure_match(
         _show_magnitude(axes, gradient_map)
         _finish(axes, f"{role} {name}")
     _draw_associations(figure, left, right, associations, inliers)
-    if np.isfinite(candidate.T_target_source).all():
-        _overlay(figure.add_subplot(grid[1, 0]), source_map, target_map, candidate.T_target_source)
-        _show_both(figure.add_subplot(grid[1, 1]), source_map, target_map, candidate.T_target_source)
+    if np.isfinite(T).all():
+        _show_overlay(figure.add_subplot(grid[1, 0]), Overlay(source_map, target_map, T))
+        _show_both(figure.add_subplot(grid[1, 1]), source_map, target_map, T)
     return figure
 
 
@@ -213,33 +214,32 @@ def _draw_associations(
 
 
 def _planar(T_target_source: Array) -> Array:
-    """The part of an SE(3) transform, nearly upright, that acts in the plane."""
-    return T_target_source[np.ix_([0, 1, 3], [0, 1, 3])]
+    """SE(2) part of an SE(3) transform that is nearly upright."""
+    return se2(T_target_source[0, 3], T_target_source[1, 3], yaw_of(T_target_source))
 
 
-def _overlay(axes: Axes, source_map: GradientMap, target_map: GradientMap, T_target_source: Array) -> None:
+def _show_overlay(axes: Axes, overlay: Overlay) -> None:
     """Source in one colour over the target in its opposite: grey where they agree."""
-    moved = warp(source_map.magnitude, source_map, target_map, _planar(T_target_source))
-    both = shared_ground(source_map, target_map, _planar(T_target_source))
-    steep = _steepest(target_map)
-    image = np.ones((*both.shape, 3))
-    image[both, 0] = np.clip(moved / steep, 0, 1)[both]
-    image[both, 1] = image[both, 2] = np.clip(target_map.magnitude / steep, 0, 1)[both]
-    axes.imshow(image, origin="lower", extent=_extent(target_map))
-    _finish(axes, "aligned, shared ground: grey agrees, red source only, cyan target only")
+    target = overlay.target
+    steep = _steepest(target)
+    image = np.ones((*overlay.shared.shape, 3))
+    image[overlay.shared, 0] = np.clip(overlay.of_source(overlay.source.magnitude) / steep, 0, 1)
+    image[overlay.shared, 1:] = np.clip(overlay.of_target(target.magnitude) / steep, 0, 1)[:, None]
+    axes.imshow(image, origin="lower", extent=_extent(target))
+    _finish(axes, "aligned overlap: grey agrees, red source only, cyan target only")
 
 
-def _show_both(axes: Axes, source_map: GradientMap, target_map: GradientMap, T_target_source: Array) -> None:
-    """Both maps' known ground, the source's moved into the target's frame."""
+def _show_both(axes: Axes, source_map: GradientMap, target_map: GradientMap, T_planar: Array) -> None:
+    """Both maps' observed areas, the source's moved into the target's frame."""
     for gradient_map, T, colour in (
         (target_map, np.eye(3), TARGET_COLOUR),
-        (source_map, _planar(T_target_source), SOURCE_COLOUR),
+        (source_map, T_planar, SOURCE_COLOUR),
     ):
         rows, columns = np.nonzero(gradient_map.mask)
         step = max(1, len(rows) // DRAWN_POINTS)
         ground = np.stack([columns, rows], axis=1)[::step] * gradient_map.resolution + gradient_map.origin
         axes.plot(*transform(T, ground).T, ".", color=colour, markersize=1, alpha=0.25)
-    _finish(axes, "known ground: source (red) over target (blue), target frame")
+    _finish(axes, "observed areas: source (red) over target (blue), target frame")
 
 
 def _finish(axes: Axes, title: str) -> None:

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from terrainloop import __version__
 from terrainloop.config import Settings
 from terrainloop.detection.detector import fit_database, map_submap
+from terrainloop.entry import MapEntry
 from terrainloop.evaluation.baselines.method import Match, Method, Observation
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.loop import LoopCandidate
-from terrainloop.matching.mapped import MappedSubmap
 from terrainloop.matching.register import compare
 from terrainloop.submap import Submap
 
@@ -38,10 +38,10 @@ def method(name: str, settings: Settings, parameters: Hyperparameters | None = N
         As `parameters_for` finds them; without them they are fitted to every submap.
     """
 
-    def describe(observation: Observation) -> MappedSubmap:
+    def describe(observation: Observation) -> MapEntry:
         return map_submap(observation.submap, settings, parameters)
 
-    def score(source: MappedSubmap, target: MappedSubmap) -> Match:
+    def score(source: MapEntry, target: MapEntry) -> Match:
         candidate = compare(source, target, settings)
         return Match(_score(candidate, settings), candidate.T_target_source)
 

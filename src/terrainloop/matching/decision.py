@@ -1,0 +1,164 @@
+"""The default decision: a loop closure if chance cannot explain the best hypothesis and nothing rivals it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrainloop.config import Settings
+from terrainloop.entry import MapEntry
+from terrainloop.geometry import transform
+from terrainloop.loop import NO_EVIDENCE, LoopCandidate
+from terrainloop.matching.hypotheses import Hypothesis, Pair, propose_hypotheses
+from terrainloop.matching.lift import PlanarPrecision, lift_to_se3
+from terrainloop.matching.overlay import Overlay
+from terrainloop.matching.query import Query
+from terrainloop.matching.refine import Refinement, refine
+from terrainloop.matching.significance import log_num_tests
+from terrainloop.matching.ssd import compute_ssd
+
+REJECTED_STEP = 3  # every third row and column is enough to show a rejected pair
+UNKNOWN = np.full((3, 3), np.nan)
+LN_10 = float(np.log(10.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """The best hypothesis of a pair among its rivals, and what a loop closure needs.
+
+    Attributes
+    ----------
+    best : Hypothesis
+        The most surprising one, of those whose correlation is high enough if there are any.
+    rivals : list of Hypothesis
+        All whose correlation is high enough.
+    log_tests : float
+        Natural logarithm of the number of tests in this pair.
+    needed : float
+        Surprisal at which the expected number of false loops of the run is what is allowed, nats.
+    """
+
+    best: Hypothesis
+    rivals: list[Hypothesis]
+    log_tests: float
+    needed: float
+
+    @classmethod
+    def of(cls, pair: Pair, hypotheses: list[Hypothesis], pairs: float) -> "Weighed":
+        """Weigh the hypotheses of a pair, one of `pairs` in the run."""
+        calibration = pair.settings.calibration
+        rivals = [h for h in hypotheses if h.agreement.correlation >= calibration.min_correlation]
+        log_tests = log_num_tests(pair.found.tried, pair.found.surprisals[1:], calibration)
+        needed = log_tests + float(np.log(pairs / pair.settings.match.max_false_loops))
+        return cls(max(rivals or hypotheses, key=lambda h: h.surprisal), rivals, log_tests, needed)
+
+    @property
+    def log_nfa(self) -> float:
+        """Decimal logarithm of the number of false alarms of the best hypothesis in one pair."""
+        return (self.log_tests - self.best.surprisal) / LN_10
+
+    @property
+    def significant(self) -> bool:
+        """Whether chance yields such a hypothesis in no more than the allowed number of loops."""
+        return self.best.surprisal >= self.needed
+
+
+def compare_by_evidence(query: Query, target: MapEntry, settings: Settings, pairs: float) -> LoopCandidate:
+    """Search, propose, refine; take the hypothesis that chance explains least, and decide.
+
+    Parameters
+    ----------
+    query : Query
+        Made for the search grid of the two submaps.
+    target : MapEntry
+    settings : Settings
+    pairs : float
+        Number of pairs compared in the run; `max_false_loops` is for all of them.
+    """
+    pair = Pair.of(query, target, settings)
+    names = query.entry.name, target.name
+    if pair.found.tried == 0:
+        area = settings.calibration.min_shared_area * pair.length_scale**2
+        least = f"{area:.3g} m^2 at a length scale of {pair.length_scale:.2g} m"
+        return LoopCandidate.without_transform(*names, f"too little ground: an overlap of {least} is needed")
+    hypotheses = propose_hypotheses(pair)
+    if not hypotheses:
+        reason = "featureless: the ground has no structure that could agree"
+        return LoopCandidate.without_transform(*names, reason)
+    weighed = Weighed.of(pair, hypotheses, pairs)
+    refinement = None
+    if weighed.significant:
+        refinement = refine(*pair.maps, weighed.best.T_target_source, settings.calibration)
+    objection = _objection(pair, weighed, refinement)
+    return _candidate(pair, weighed, None if objection else refinement, objection)
+
+
+def _objection(pair: Pair, weighed: Weighed, refinement: Refinement | None) -> str:
+    """Why the best hypothesis is no loop closure, in words; empty if it is one."""
+    calibration, best = pair.settings.calibration, weighed.best
+    if not weighed.significant:
+        return "chance explains it"
+    if not weighed.rivals:
+        return f"weak agreement, correlation below {calibration.min_correlation:g}"
+    T = best.T_target_source
+    rivalling = max(
+        calibration.ambiguity_ratio * best.surprisal, weighed.log_tests - np.log(calibration.ambiguity_chance)
+    )
+    if any(h.surprisal > rivalling and not pair.same_place(h.T_target_source, T) for h in weighed.rivals):
+        return "ambiguous, another place fits as well"
+    if refinement is None or not pair.same_place(refinement.T_target_source, T):
+        return "undetermined, the refinement converges elsewhere"
+    if np.isnan(refinement.covariance).any():
+        return "undetermined, too little ground to determine the pose"
+    slid = refinement.weakest(calibration.min_separation * pair.source_field.length_scale)
+    if any(pair.weigh(T, best.found_by).surprisal > rivalling for T in slid):
+        return "undetermined, the match slides"
+    return ""
+
+
+def _candidate(pair: Pair, weighed: Weighed, refinement: Refinement | None, objection: str) -> LoopCandidate:
+    """The decision and the pose in SE(3): the best hypothesis's, without covariance, where it is no loop."""
+    best, calibration = weighed.best, pair.settings.calibration
+    if refinement is None:
+        T = best.T_target_source
+        overlay = Overlay(*pair.maps, T, REJECTED_STEP)
+        precision = PlanarPrecision(transform(T, pair.source_field.centre), UNKNOWN)
+    else:
+        T = refinement.T_target_source
+        overlay = Overlay(*pair.maps, T)
+        precision = PlanarPrecision(refinement.pivot, refinement.covariance, refinement.strain_variance)
+    T_target_source, covariance = lift_to_se3(overlay, precision, calibration)
+    ssd, inliers = compute_ssd(overlay), len(pair.inliers_of(T))
+    return LoopCandidate(
+        source=pair.source.name,
+        target=pair.target.name,
+        T_target_source=T_target_source,
+        covariance=covariance,
+        inliers=inliers,
+        ssd=ssd.value,
+        ssd_ratio=ssd.ratio,
+        overlap=ssd.overlap,
+        score=-weighed.log_nfa if weighed.rivals else NO_EVIDENCE,
+        accepted=refinement is not None,
+        reason=_reason(weighed, objection, pair.settings.match.max_false_loops),
+        found_by=best.found_by,
+        correlation=best.agreement.correlation,
+        log_nfa=weighed.log_nfa,
+        inlier_score=inliers * max(0.0, 1.0 - ssd.ratio),
+        source_origin=pair.source.gradient_map.local_origin,
+        target_origin=pair.target.gradient_map.local_origin,
+    )
+
+
+def _reason(weighed: Weighed, objection: str, allowed: float) -> str:
+    expected = _in_words((weighed.needed - weighed.best.surprisal) / LN_10 + np.log10(allowed))
+    agreement = weighed.best.agreement
+    fit = f"correlation {agreement.correlation:.2f} over {agreement.area:.3g} m^2"
+    reason = f"{expected} false loops expected, {allowed:g} allowed; {fit}"
+    return f"{objection}: {reason}" if objection else reason
+
+
+def _in_words(exponent: float) -> str:
+    """Ten to a power; nobody needs to know by how much it is below 1e-12."""
+    if exponent < -12:
+        return "below 1e-12"
+    return f"{10**exponent:.2g}" if -3 < exponent < 6 else f"1e{exponent:.0f}"
