@@ -42,7 +42,8 @@ def test_nothing_public_is_left_out():
     assert imported == set(tl.__all__)
     modules = {path.stem for path in PACKAGE.iterdir()}
     public = {name for name in vars(tl) if not name.startswith("_")} - modules
-    assert public - {"import_module", "version", "TYPE_CHECKING", "PackageNotFoundError"} <= set(tl.__all__)
+    assert public - {"TYPE_CHECKING"} <= set(tl.__all__)
+    assert set(dir(tl)) == {*tl.__all__, "__version__"}
 
 
 def test_star_import():

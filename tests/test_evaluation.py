@@ -22,8 +22,8 @@ from terrainloop.evaluation.precision_recall import (
     recall_at_full_precision,
 )
 from terrainloop.geometry import inverse, se3
-from terrainloop.io.results import SubmapRecord
 from terrainloop.loop import LoopCandidate
+from terrainloop.record import SubmapRecord
 
 SQUARE = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
 

@@ -8,103 +8,111 @@ import pytest
 from conftest import STRICT, map_of, with_match
 from scipy.stats import beta, binom
 
-from terrainloop.geometry import inverse, se2, se3, transform, yaw_of
-from terrainloop.matching.covariance import BLOCK, block_covariance
-from terrainloop.matching.evidence import (
-    NO_EVIDENCE,
-    TAIL,
-    log_poses,
-    surprise,
-    surprise_of_both,
-    surprise_of_inliers,
-)
+from terrainloop.config import Calibration
 from terrainloop.entry import MapEntry
-from terrainloop.record import SubmapRecord
-from terrainloop.matching.refine import USUAL_STRAIN, refine
+from terrainloop.geometry import inverse, se2, se3, transform, yaw_of
+from terrainloop.loop import NO_EVIDENCE
+from terrainloop.matching import hypotheses, significance
+from terrainloop.matching.covariance import block_covariance
+from terrainloop.matching.refine import refine
 from terrainloop.matching.register import compare, register
+from terrainloop.matching.significance import combined_surprisal, surprisal_of_inliers
+from terrainloop.record import SubmapRecord
 
+CALIBRATION = Calibration()
+
+
+def surprisal(correlation_squared, samples):
+    return significance.surprisal_of_correlation(correlation_squared, samples, CALIBRATION)
+
+
+def log_num_tests(tried, others):
+    return significance.log_num_tests(tried, others, CALIBRATION)
+
+
+BLOCK = 2.0
 BIG = {"origin": (-4.0, -4.0), "shape": (100, 100)}
 
 # --- the chance of a correlation
 
 
 @pytest.mark.parametrize("samples", [8, 30, 100])
-def test_surprise_is_the_chance_of_independent_samples(samples):
-    """The tail falls with the surprise, from a half of it at no correlation to some tenths of it."""
+def test_surprisal_is_the_chance_of_independent_samples(samples):
+    """The tail falls with the surprisal, from a half of it at no correlation to some tenths of it."""
     rng = np.random.default_rng(samples)
     x, y = rng.normal(size=(2, 100_000, samples)).astype(np.float32)
     r = (x * y).sum(1) / np.sqrt((x**2).sum(1) * (y**2).sum(1))
     assert np.mean(r**2) * samples == pytest.approx(1.0, rel=0.03)  # what the search takes for samples
     for chance in (0.3, 0.1, 0.01, 0.001):
         value = np.quantile(r, 1 - chance)
-        bound = np.exp(-surprise(value**2, samples))
+        bound = np.exp(-surprisal(value**2, samples))
         assert 0.9 * chance < bound < 10 * chance
 
 
 @pytest.mark.parametrize(
     ("samples", "chance"), [(4.5, 1e-2), (20, 1e-6), (20, 1e-12), (1e3, 1e-6), (1e3, 1e-100), (1e5, 1e-300)]
 )
-def test_surprise_of_far_tails_bounds_the_exact_law(samples, chance):
+def test_surprisal_of_far_tails_bounds_the_exact_law(samples, chance):
     """r^2 of n samples follows a beta law, half of its tail for each sign; in nats the bound is near."""
-    value = surprise(beta.isf(2 * chance, 0.5, (samples - 1) / 2), samples)
+    value = surprisal(beta.isf(2 * chance, 0.5, (samples - 1) / 2), samples)
     assert -np.log(chance) - 5 < value < -np.log(chance)
 
 
-def test_surprise_grows_with_correlation_and_with_samples():
+def test_surprisal_grows_with_correlation_and_with_samples():
     squared, samples = np.linspace(0, 0.99, 40), np.linspace(1.5, 500, 30)
-    values = surprise(squared[:, None], samples)
+    values = surprisal(squared[:, None], samples)
     assert values.shape == (40, 30)
     assert (np.diff(values, axis=0) > 0).all()
     assert (np.diff(values[1:], axis=1) > 0).all()
 
 
-def test_surprise_at_the_ends():
-    assert surprise(0.0, 100.0) == 0
+def test_surprisal_at_the_ends():
+    assert surprisal(0.0, 100.0) == 0
     for nothing in (0.0, 0.5, 1.0):  # samples
-        assert surprise(0.9, nothing) == 0
-    assert np.isfinite(surprise(1.0, 100.0))
-    assert surprise(1.0, 100.0) > surprise(0.9, 100.0)
-    assert surprise(1.0, 100.0) == surprise(0.9999, 100.0)  # no map is trusted to agree that well
+        assert surprisal(0.9, nothing) == 0
+    assert np.isfinite(surprisal(1.0, 100.0))
+    assert surprisal(1.0, 100.0) > surprisal(0.9, 100.0)
+    assert surprisal(1.0, 100.0) == surprisal(0.9999, 100.0)  # no map is trusted to agree that well
 
 
-def test_surprise_of_inliers_is_the_binomial_tail():
+def test_surprisal_of_inliers_is_the_binomial_tail():
     for inliers, associations, chance in ((1, 40, 0.01), (3, 130, 0.002), (20, 150, 0.003), (40, 40, 0.5)):
         exact = -binom.logsf(inliers - 1, associations, chance)
-        assert surprise_of_inliers(inliers, associations, chance) == pytest.approx(exact, rel=1e-6)
-    assert surprise_of_inliers(0, 50, 0.01) == surprise_of_inliers(-2, 50, 0.01) == 0
-    assert surprise_of_inliers(3, 3, 1.0) == pytest.approx(0)
-    assert np.isfinite(surprise_of_inliers(400, 400, 1e-4))
+        assert surprisal_of_inliers(inliers, associations, chance) == pytest.approx(exact, rel=1e-6)
+    assert surprisal_of_inliers(0, 50, 0.01) == surprisal_of_inliers(-2, 50, 0.01) == 0
+    assert surprisal_of_inliers(3, 3, 1.0) == pytest.approx(0)
+    assert np.isfinite(surprisal_of_inliers(400, 400, 1e-4))
 
 
-def test_two_surprises_are_as_rare_together_as_they_say():
+def test_two_surprisals_are_as_rare_together_as_they_say():
     """Independent ones of unit decay: chance exceeds a level no more often than exp(-level), nor far less."""
     rng = np.random.default_rng(0)
     field, inliers = rng.exponential(size=(2, 200_000))
-    both = np.array([surprise_of_both(f, i) for f, i in zip(field, inliers, strict=True)])
+    both = np.array([combined_surprisal(f, i) for f, i in zip(field, inliers, strict=True)])
     for level in (1.0, 3.0, 5.0):
         assert 0.4 * np.exp(-level) < (both >= level).mean() < 1.05 * np.exp(-level)
 
 
 def test_inliers_can_only_help():
     """But for the factor of two that it costs to look at them."""
-    assert surprise_of_both(30.0, 0.0) == pytest.approx(30.0 - np.log(2))
-    assert surprise_of_both(30.0, 30.0) > 54.0
-    assert surprise_of_both(0.0, 0.0) == 0.0
-    values = [surprise_of_both(12.0, inliers) for inliers in np.linspace(0, 50, 60)]
+    assert combined_surprisal(30.0, 0.0) == pytest.approx(30.0 - np.log(2))
+    assert combined_surprisal(30.0, 30.0) > 54.0
+    assert combined_surprisal(0.0, 0.0) == 0.0
+    values = [combined_surprisal(12.0, inliers) for inliers in np.linspace(0, 50, 60)]
     assert (np.diff(values) >= 0).all()
 
 
 def test_the_number_of_poses_goes_with_what_was_tried():
     none = np.empty(0)
-    assert log_poses(1e6, none) - log_poses(1e4, none) == pytest.approx(np.log(100))
-    assert log_poses(0.0, none) == 0.0
+    assert log_num_tests(1e6, none) - log_num_tests(1e4, none) == pytest.approx(np.log(100))
+    assert log_num_tests(0.0, none) == 0.0
 
 
 def test_like_places_count_as_poses():
-    usual = log_poses(1e5, np.array([9.0, 8.0, 7.0]))
-    assert usual == log_poses(1e5, np.empty(0))
-    abounding = log_poses(1e5, np.linspace(25.0, 20.0, 10))
-    assert abounding == pytest.approx(TAIL * 20 + np.log(10))
+    usual = log_num_tests(1e5, np.array([9.0, 8.0, 7.0]))
+    assert usual == log_num_tests(1e5, np.empty(0))
+    abounding = log_num_tests(1e5, np.linspace(25.0, 20.0, 10))
+    assert abounding == pytest.approx(0.85 * 20 + np.log(10))
     assert abounding > usual
 
 
@@ -132,7 +140,7 @@ def test_covariance_is_that_of_many_fits_with_noise_by_the_block():
         fit = np.linalg.solve(normal, jacobian.T @ (weights * noise))
         residual = noise - jacobian @ fit
         fits.append(fit)
-        claimed.append(block_covariance(jacobian, weights * residual, normal, ground, length_scale))
+        claimed.append(block_covariance(jacobian, weights * residual, normal, ground, BLOCK * length_scale))
     np.testing.assert_allclose(np.diag(np.mean(claimed, 0)), np.var(fits, axis=0), rtol=0.2)
     normalised = [e @ np.linalg.solve(c, e) for e, c in zip(fits, claimed, strict=True)]
     assert 2.6 < np.mean(normalised) < 3.8  # 3 for known covariances
@@ -143,9 +151,9 @@ def test_two_components_at_a_place_are_in_one_block():
     ground = rng.uniform(0, 20, (300, 2))
     jacobian, residual = rng.normal(size=(2, 300, 4)), rng.normal(size=(2, 300))
     normal = np.einsum("cnp,cnq->pq", jacobian, jacobian)
-    both = block_covariance(jacobian, residual, normal, ground, 0.9)
+    both = block_covariance(jacobian, residual, normal, ground, BLOCK * 0.9)
     flat = block_covariance(
-        jacobian.reshape(-1, 4), residual.ravel(), normal, np.vstack([ground, ground]), 0.9
+        jacobian.reshape(-1, 4), residual.ravel(), normal, np.vstack([ground, ground]), BLOCK * 0.9
     )
     np.testing.assert_allclose(both, flat)
     np.testing.assert_allclose(both, both.T)
@@ -156,13 +164,13 @@ def test_covariance_scales_with_the_residuals_and_not_with_the_origin():
     rng = np.random.default_rng(0)
     ground = BLOCK * rng.integers(0, 9, (300, 2)) + rng.uniform(0.1, BLOCK - 0.1, (300, 2))
     jacobian, residual = rng.normal(size=(300, 3)), rng.normal(size=300)
-    here = block_covariance(jacobian, residual, jacobian.T @ jacobian, ground, 1.0)
+    here = block_covariance(jacobian, residual, jacobian.T @ jacobian, ground, BLOCK)
     for blocks in ([250_000, -2_000_000], [-4, -8], [-9, -9]):
         moved = ground + BLOCK * np.array(blocks)
-        there = block_covariance(jacobian, residual, jacobian.T @ jacobian, moved, 1.0)
+        there = block_covariance(jacobian, residual, jacobian.T @ jacobian, moved, BLOCK)
         np.testing.assert_allclose(there, here)
     np.testing.assert_allclose(
-        block_covariance(jacobian, 3 * residual, jacobian.T @ jacobian, ground, 1.0), 9 * here
+        block_covariance(jacobian, 3 * residual, jacobian.T @ jacobian, ground, BLOCK), 9 * here
     )
 
 
@@ -170,12 +178,14 @@ def test_covariance_scales_with_the_residuals_and_not_with_the_origin():
 def test_no_more_blocks_than_parameters_tell_nothing(blocks):
     ground = np.c_[BLOCK * np.arange(60) % (BLOCK * blocks) + 0.5, np.full(60, 0.5)]
     jacobian = np.random.default_rng(0).normal(size=(60, 3))
-    covariance = block_covariance(jacobian, np.ones(60), jacobian.T @ jacobian, ground, 1.0)
+    covariance = block_covariance(jacobian, np.ones(60), jacobian.T @ jacobian, ground, BLOCK)
     assert covariance.shape == (3, 3)
     assert np.isnan(covariance).all()
     ground[0] = 50.0  # one more
     if blocks == 3:
-        assert np.isfinite(block_covariance(jacobian, np.ones(60), jacobian.T @ jacobian, ground, 1.0)).all()
+        assert np.isfinite(
+            block_covariance(jacobian, np.ones(60), jacobian.T @ jacobian, ground, BLOCK)
+        ).all()
 
 
 # --- the covariance of a pose
@@ -190,7 +200,7 @@ def test_the_pose_errs_no_more_than_its_covariance_says(world, gp_map):
         ground = world(seed % 6)
         source = gp_map(ground.observe(frame, (0.3, 0.2), seed=seed, count=2000, noise=0.02))
         target = gp_map(ground.observe(np.eye(4), (0.0, 0.0), seed=100 + seed, count=2000, noise=0.02))
-        found = refine(source, target, se2(0.03, -0.05, 0.02) @ T)
+        found = refine(source, target, se2(0.03, -0.05, 0.02) @ T, CALIBRATION)
         move = found.T_target_source @ inverse(T)
         error = [*(transform(move, found.pivot) - found.pivot), yaw_of(move)]
         values.append(error @ np.linalg.solve(found.covariance, error))
@@ -206,9 +216,9 @@ def test_maps_that_are_stretched_are_found_so(world):
         return height, slope * [1.01, 0.99]
 
     target = world(0).map(**BIG)
-    rigid = refine(world(0).map(**BIG), target, np.eye(3)).strain_variance
-    strained = refine(map_of(stretched, **BIG), target, np.eye(3)).strain_variance
-    assert np.sqrt(rigid) < USUAL_STRAIN
+    rigid = refine(world(0).map(**BIG), target, np.eye(3), CALIBRATION).strain_variance
+    strained = refine(map_of(stretched, **BIG), target, np.eye(3), CALIBRATION).strain_variance
+    assert np.sqrt(rigid) < CALIBRATION.usual_strain
     assert np.sqrt(strained) == pytest.approx(0.01 / np.sqrt(2), rel=0.3)
 
 
@@ -264,10 +274,8 @@ def test_what_proposed_the_pose_is_told(world):
 
 
 def test_keypoints_find_what_the_search_misses(world, monkeypatch):
-    from terrainloop.matching import by_evidence
-
-    whole = by_evidence.search
-    monkeypatch.setattr(by_evidence, "search", lambda a, b, count: replace(whole(a, b, count), places=[]))
+    whole = hypotheses.search
+    monkeypatch.setattr(hypotheses, "search", lambda *args: replace(whole(*args), poses=[]))
     T = se2(0.4, -0.3, 0.7)
     loop = judge(world(0).map(T, **BIG), world(0).map(**BIG))
     assert loop

@@ -5,21 +5,30 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from terrainloop import field as fields_module
+from terrainloop.config import Calibration
+from terrainloop.field import Field, rotate_field
 from terrainloop.geometry import inverse, se2
-from terrainloop.matching.field import Field, agreement_at, field_of, turn_field
+from terrainloop.matching.overlay import agreement_at
 
 SPACING = 0.2
+
+
+def field_of(gradient_map, spacing):
+    return fields_module.field_of(gradient_map, spacing, Calibration())
+
+
 BIG = {"origin": (-4.0, -4.0), "shape": (100, 100)}
 HALF_TURNED = se2(1.5, -0.6, 2.3)  # shares most of the ground
 
 
 def images_of(field):
-    return np.stack([field.x, field.y, field.known])
+    return np.stack([field.x, field.y, field.valid])
 
 
 def assert_same_field(a, b, atol=2e-4):
     """Up to rounding; the images are of the order of one."""
-    assert a.known.sum() > 100
+    assert a.valid.sum() > 100
     assert np.abs(a.x).max() > 0.01
     np.testing.assert_allclose(images_of(a), images_of(b), rtol=0, atol=atol * np.abs(a.x).max())
 
@@ -74,7 +83,7 @@ def test_unknown_ground_is_zero_whatever_the_map_says_there(terrain):
     holed = replace(terrain, mask=mask)
     garbage = np.random.default_rng(0).normal(0, 50, mask.shape).astype(np.float32) * ~mask
     field = field_of(holed, SPACING)
-    unknown = field.known == 0
+    unknown = field.valid == 0
     assert 0.2 < unknown.mean() < 0.6
     assert not field.x[unknown].any()
     assert not field.y[unknown].any()
@@ -92,19 +101,19 @@ def test_known_ground_is_where_the_mask_is(terrain):
     mask = np.zeros(terrain.mask.shape, bool)
     mask[13:41, 20:44] = True
     field = field_of(replace(terrain, mask=mask), SPACING)
-    rows, columns = np.indices(field.known.shape)
+    rows, columns = np.indices(field.valid.shape)
     x, y, _ = field.metres_from_pixels @ np.stack([columns, rows, np.ones_like(rows)]).reshape(3, -1)
     (x0, y0), r = terrain.origin, terrain.resolution
     inside = (abs(x - x0 - 31.5 * r) < 12 * r) & (abs(y - y0 - 26.5 * r) < 14 * r)
     border = (abs(abs(x - x0 - 31.5 * r) - 12 * r) < 0.06) | (abs(abs(y - y0 - 26.5 * r) - 14 * r) < 0.06)
     sure = ~border
     assert sure.sum() > 250
-    np.testing.assert_array_equal(field.known.ravel()[sure] > 0, inside[sure])
+    np.testing.assert_array_equal(field.valid.ravel()[sure] > 0, inside[sure])
 
 
 def test_the_last_row_and_column_are_covered(terrain):
     for spacing in (0.08, 0.15, 0.2, 0.33):
-        rows, columns = field_of(terrain, spacing).known.shape
+        rows, columns = field_of(terrain, spacing).valid.shape
         for count, pixels in ((rows, 60), (columns, 50)):
             assert 0 <= (count - 1) * spacing - (pixels - 1) * terrain.resolution + 1e-9 < spacing + 1e-9
 
@@ -126,14 +135,14 @@ def test_a_map_that_knows_nothing_has_no_field(world, shape):
     unknown = world(0).map(shape=shape)
     field = field_of(replace(unknown, mask=np.zeros(shape, bool)), SPACING)
     assert nothing_in(field)
-    assert not field.known.any()
+    assert not field.valid.any()
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (2, 2), (3, 3)])
 def test_tiny_maps_have_a_field(world, shape):
     field = field_of(world(0).map(shape=shape), SPACING)
     assert np.isfinite(images_of(field)).all()
-    assert field.known.shape == field.x.shape == field.y.shape
+    assert field.valid.shape == field.x.shape == field.y.shape
 
 
 def test_flat_ground_beside_unknown_slopes_has_no_field(terrain):
@@ -192,10 +201,10 @@ def test_waves_that_stand_out_are_taken_down(world):
 def test_turned_vectors_point_where_the_turn_takes_them(yaw):
     """A field that points along x everywhere points along the yaw once turned."""
     ones = np.ones((41, 41), np.float32)
-    field = Field(ones, 0 * ones, ones, (0.0, 0.0), 1.0)
+    field = Field(ones, 0 * ones, ones, (0.0, 0.0), 1.0, 2.0)
     middle = se2(20.0, 20.0, 0.0)
     turn = middle @ se2(0.0, 0.0, yaw) @ inverse(middle)
-    x, y, known = turn_field(field, inverse(turn), (41, 41))
+    x, y, known = rotate_field(field, inverse(turn), (41, 41))
     assert known[20, 20] == 1
     assert x[20, 20] == pytest.approx(np.cos(yaw), abs=1e-6)
     assert y[20, 20] == pytest.approx(np.sin(yaw), abs=1e-6)
@@ -204,9 +213,9 @@ def test_turned_vectors_point_where_the_turn_takes_them(yaw):
 def test_turned_ground_lies_where_the_turn_takes_it():
     spot = np.zeros((31, 31), np.float32)
     spot[10, 25] = 1.0  # column 25, row 10
-    field = Field(spot, 0 * spot, np.ones_like(spot), (0.0, 0.0), 1.0)
+    field = Field(spot, 0 * spot, np.ones_like(spot), (0.0, 0.0), 1.0, 2.0)
     quarter = np.array([[0.0, -1.0, 30.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # to column 20, row 25
-    x, y, known = turn_field(field, np.linalg.inv(quarter), (31, 31))
+    x, y, known = rotate_field(field, np.linalg.inv(quarter), (31, 31))
     assert np.unravel_index(y.argmax(), y.shape) == (25, 20)
     assert y[25, 20] == pytest.approx(1.0)
     assert np.abs(x).max() < 1e-6
@@ -221,7 +230,7 @@ def test_a_map_agrees_with_itself_and_not_with_its_opposite(terrain):
     opposite = field_of(scaled(terrain, heights=-1.0), SPACING)
     agreement = agreement_at(field, field, np.eye(3))
     assert agreement.correlation == pytest.approx(1.0, abs=1e-6)
-    assert agreement.area == pytest.approx(field.known.sum() * SPACING**2)
+    assert agreement.area == pytest.approx(field.valid.sum() * SPACING**2)
     assert agreement_at(field, opposite, np.eye(3)).correlation == pytest.approx(-1.0, abs=1e-6)
 
 

@@ -5,11 +5,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from conftest import STRICT
 
+from terrainloop.entry import MapEntry
 from terrainloop.evaluation.precision_recall import OperatingPoint
+from terrainloop.features import extract_features
 from terrainloop.geometry import se2, se3
 from terrainloop.loop import LoopCandidate
-from terrainloop.matching.correspondences import Associations
+from terrainloop.record import SubmapRecord
 from terrainloop.report.figures import (
     figure_map,
     figure_match,
@@ -33,7 +36,6 @@ NO_LOOP = replace(
     inliers=0,
     reason="no two of 0 associations agree on a transform",
 )
-NO_ASSOCIATIONS = Associations(np.empty((0, 2)), np.empty((0, 2)))
 
 
 @pytest.fixture(scope="module")
@@ -60,9 +62,8 @@ def flat(gradient_map):
     return replace(gradient_map, elevation=zero, gradient_x=zero, gradient_y=zero)
 
 
-def associations(count):
-    rng = np.random.default_rng(0)
-    return Associations(*rng.uniform(-1.5, 1.5, (2, count, 2))), np.arange(count) % 3 == 0
+def entry(gradient_map):
+    return MapEntry.of(SubmapRecord("submap"), gradient_map, STRICT)
 
 
 def pictures(make, tmp_path):
@@ -113,46 +114,37 @@ def test_map_far_from_the_origin(submap, source, tmp_path):
     assert drawn_share(pictures(lambda: figure_map(cloud, far), tmp_path)) > 0.25
 
 
+def match(source, target, candidate):
+    return figure_match(entry(source), entry(target), candidate, STRICT)
+
+
 def test_match(source, target, tmp_path):
-    drawn, inliers = associations(15)
-    loop = pictures(lambda: figure_match(source, target, LOOP, drawn, inliers), tmp_path)
+    loop = pictures(lambda: match(source, target, LOOP), tmp_path)
     assert drawn_share(loop) > 0.25
-    none = pictures(lambda: figure_match(source, target, LOOP, *associations(0)), tmp_path)
+    without = entry(source)
+    without = replace(without, features=extract_features(flat(source), STRICT.features))
+    none = pictures(lambda: figure_match(without, entry(target), LOOP, STRICT), tmp_path)
     assert (loop != none).any(axis=-1).mean() > 0.001  # the associations show
 
 
 def test_match_that_was_rejected(source, target, tmp_path):
     """Without a transform there is nothing to lay over each other."""
-    rejected = pictures(lambda: figure_match(source, target, NO_LOOP, *associations(6)), tmp_path)
-    accepted = pictures(lambda: figure_match(source, target, LOOP, *associations(6)), tmp_path)
+    rejected = pictures(lambda: match(source, target, NO_LOOP), tmp_path)
+    accepted = pictures(lambda: match(source, target, LOOP), tmp_path)
     assert drawn_share(rejected) > 0.02
     assert drawn_share(accepted) > drawn_share(rejected)
 
 
-def test_match_of_unknown_ground(source, target, tmp_path):
-    nothing = np.zeros(0, dtype=bool)
+@pytest.mark.parametrize("ground", [unknown, flat])
+def test_match_of_nothing_to_see(source, target, tmp_path, ground):
     for candidate in (NO_LOOP, LOOP):
-        image = pictures(
-            lambda candidate=candidate: figure_match(
-                unknown(source), unknown(target), candidate, NO_ASSOCIATIONS, nothing
-            ),
-            tmp_path,
-        )
+        image = pictures(lambda c=candidate: match(ground(source), ground(target), c), tmp_path)
         assert drawn_share(image) > 0.005
-
-
-def test_match_of_flat_ground(source, target, tmp_path):
-    image = pictures(
-        lambda: figure_match(flat(source), flat(target), LOOP, NO_ASSOCIATIONS, np.zeros(0, bool)), tmp_path
-    )
-    assert drawn_share(image) > 0.005
 
 
 def test_match_laid_far_apart(source, target, tmp_path):
     apart = replace(LOOP, T_target_source=se3(80.0, 0, 0, 0, 0, 0))
-    assert (
-        drawn_share(pictures(lambda: figure_match(source, target, apart, *associations(3)), tmp_path)) > 0.01
-    )
+    assert drawn_share(pictures(lambda: match(source, target, apart), tmp_path)) > 0.01
 
 
 POSES = np.array([se3(6.0 * i, 1.0 * (i % 2), 0, 0, 0, 0.3 * i) for i in range(4)])

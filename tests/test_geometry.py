@@ -2,9 +2,22 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from terrainloop.geometry import fit_se2, inverse, parameters_of, se2, se3, transform, yaw_of
+from terrainloop.geometry import (
+    adjoint_se3,
+    exp_se3,
+    fit_se2,
+    inverse,
+    log_se3,
+    parameters_of,
+    se2,
+    se3,
+    tangent_covariance,
+    transform,
+    yaw_of,
+)
 
 UTM = np.array([431234.125, 3761234.5])
 
@@ -149,3 +162,77 @@ def test_fit_keeps_its_digits_far_from_the_origin():
     far = fit_se2(source + UTM, target + UTM)
     assert yaw_of(far) == pytest.approx(1.0, abs=1e-9)
     np.testing.assert_allclose(transform(far, source + UTM) - UTM, target, rtol=0, atol=1e-7)
+
+
+# --- the Lie group SE(3)
+
+
+def hat(tangent):
+    w, v = tangent[:3], tangent[3:]
+    T = np.zeros((4, 4))
+    T[:3, 3] = v
+    T[:3, :3] = [[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]]
+    return T
+
+
+TANGENTS = [
+    *np.random.default_rng(3).normal(size=(6, 6)),
+    np.zeros(6),
+    1e-7 * np.arange(6.0),
+    [0, 0, 0, 1, 2, 3],
+]
+
+
+@pytest.mark.parametrize("tangent", TANGENTS)
+def test_exp_is_the_matrix_exponential(tangent):
+    tangent = np.asarray(tangent, dtype=float)
+    np.testing.assert_allclose(exp_se3(tangent), expm(hat(tangent)), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("tangent", TANGENTS)
+def test_log_is_the_inverse_of_exp(tangent):
+    np.testing.assert_allclose(log_se3(exp_se3(tangent)), tangent, rtol=0, atol=1e-12)
+
+
+def test_adjoint_carries_a_perturbation_across():
+    rng = np.random.default_rng(4)
+    for parameters in random_parameters(5, seed=3):
+        T, tangent = matrix(parameters), 0.3 * rng.normal(size=6)
+        left = exp_se3(adjoint_se3(T) @ tangent) @ T
+        np.testing.assert_allclose(T @ exp_se3(tangent), left, rtol=0, atol=1e-10)
+
+
+def steep_covariance(seed):
+    root = np.random.default_rng(seed).normal(size=(6, 6)) * [0.1, 0.2, 0.05, 0.01, 0.02, 0.03]
+    return root.T @ root
+
+
+@pytest.mark.parametrize("parameters", random_parameters(5, seed=5))
+def test_tangent_covariance_by_finite_differences(parameters):
+    """The tangent of T^-1 T(p + dp), rotation first, by central differences in each parameter."""
+    T, step = se3(*parameters), 1e-6
+    jacobian = np.array(
+        [
+            (log_se3(inverse(T) @ se3(*(parameters + d))) - log_se3(inverse(T) @ se3(*(parameters - d))))
+            / (2 * step)
+            for d in step * np.eye(6)
+        ]
+    ).T
+    covariance = steep_covariance(0)
+    expected = jacobian @ covariance @ jacobian.T
+    found = tangent_covariance(T, covariance)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
+    first = [3, 4, 5, 0, 1, 2]
+    np.testing.assert_allclose(
+        tangent_covariance(T, covariance, "g2o"), found[np.ix_(first, first)], rtol=1e-12
+    )
+
+
+def test_tangent_covariance_whitens_what_was_drawn():
+    """Transforms drawn by their parameters: squared tangents, normalised, average to six."""
+    parameters, covariance = np.array([3.0, -2.0, 0.5, 0.1, -0.2, 2.5]), 1e-2 * steep_covariance(1)
+    T = se3(*parameters)
+    draws = np.random.default_rng(0).multivariate_normal(parameters, covariance, 4000)
+    tangents = np.array([log_se3(inverse(T) @ se3(*draw)) for draw in draws])
+    information = np.linalg.inv(tangent_covariance(T, covariance))
+    assert np.einsum("ni,ij,nj->n", tangents, information, tangents).mean() == pytest.approx(6, rel=0.05)

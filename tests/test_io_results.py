@@ -7,15 +7,9 @@ from clouds_util import UTM, ground
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import se3
-from terrainloop.io import (
-    SubmapRecord,
-    read_loops,
-    read_submaps,
-    submap_record,
-    write_loops,
-    write_submaps,
-)
+from terrainloop.io import read_loops, read_submaps, write_loops, write_submaps
 from terrainloop.loop import LoopCandidate
+from terrainloop.record import SubmapRecord
 from terrainloop.submap import Submap
 
 CONTRACT = (
@@ -38,6 +32,10 @@ def _candidates():
         reason='17 inliers, "sure"\nand certain',
         found_by="dense",
         correlation=0.1 + 0.2,
+        log_nfa=-12.1,
+        inlier_score=1 / 3,
+        source_origin=np.array([1.0, 2.0, 3.0]),
+        target_origin=UTM,
         **common,
     )
     none = LoopCandidate(
@@ -88,7 +86,9 @@ def test_loops_keep_the_contract(tmp_path):
         "cov_x_yaw",
         "cov_y_y",
     ]
-    assert names[14 + 20 :] == ["cov_yaw_yaw", "ssd_ratio", "found_by", "correlation"]
+    assert names[34:38] == ["cov_yaw_yaw", "ssd_ratio", "found_by", "correlation"]
+    assert names[38:40] == ["log_nfa", "inlier_score"]
+    assert names[40:] == [f"{end}_origin_{axis}_m" for end in ("source", "target") for axis in "xyz"]
     assert (rows[0]["accepted"], rows[1]["accepted"]) == ("true", "false")
     assert (rows[0]["inliers"], rows[0]["score"], rows[0]["ssd"]) == ("17", "12.000000000000002", str(1 / 3))
     assert (rows[0]["found_by"], rows[0]["correlation"]) == ("dense", "0.30000000000000004")
@@ -97,6 +97,19 @@ def test_loops_keep_the_contract(tmp_path):
     assert float(rows[0]["ty_m"]) == UTM[1]
     assert float(rows[0]["yaw_rad"]) == pytest.approx(3.0, abs=1e-15)
     assert float(rows[0]["cov_y_yaw"]) == _candidates()[0].covariance[1, 5]
+
+
+def test_files_of_before_columns_were_added_are_read(tmp_path):
+    path = tmp_path / "loops.csv"
+    write_loops(path, _candidates()[1:])
+    path.write_text(
+        "".join(",".join(line.split(",")[:38]) + "\n" for line in path.read_text("utf-8").splitlines()),
+        "utf-8",
+    )
+    (old,) = read_loops(path)
+    assert old.source == "ü 8"
+    assert np.isnan(old.log_nfa)
+    assert not old.source_origin.any()
 
 
 def test_columns_added_by_others_are_passed_over(tmp_path):
@@ -183,7 +196,7 @@ def _area(hull):
 
 def test_the_hull_holds_all_points_and_is_tight():
     points = ground() + UTM
-    hull = submap_record(Submap(points)).hull
+    hull = SubmapRecord.of(Submap(points)).hull
     ahead = np.roll(hull, -1, axis=0) - hull
     behind = points[:, None, :2] - hull
     # Anticlockwise: every point lies left of every edge, but for the rounding to millimetres.
@@ -195,7 +208,7 @@ def test_the_hull_holds_all_points_and_is_tight():
 
 def test_the_hull_of_a_square():
     x, y = np.meshgrid(np.linspace(-2, 2, 21), np.linspace(0, 3, 21))
-    record = submap_record(Submap(np.column_stack([x.ravel(), y.ravel(), 0.1 * np.sin(x * y).ravel()])))
+    record = SubmapRecord.of(Submap(np.column_stack([x.ravel(), y.ravel(), 0.1 * np.sin(x * y).ravel()])))
     assert {tuple(corner) for corner in record.hull} == {(-2, 0), (2, 0), (2, 3), (-2, 3)}
     assert _area(record.hull) == pytest.approx(12)
     assert (record.points, record.status, record.notes) == (441, "ok", "")
@@ -203,12 +216,12 @@ def test_the_hull_of_a_square():
 
 def test_submaps_round_trip(tmp_path):
     path = tmp_path / "submaps.csv"
-    mended = submap_record(Submap(np.concatenate([ground(), ground()[:9]]) + UTM, name="a", stamp=1.25))
+    mended = SubmapRecord.of(Submap(np.concatenate([ground(), ground()[:9]]) + UTM, name="a", stamp=1.25))
     broken = SubmapRecord("b", 2.0, 0, "broken", notes="expected points, found none")
     write_submaps(path, [mended, broken])
-    assert path.read_text().splitlines()[0] == "name,stamp,points,status,hull_m,notes"
+    assert path.read_text().splitlines()[0] == "name,stamp,points,status,hull_m,notes,session"
     for again, record in zip(read_submaps(path), [mended, broken], strict=True):
-        for field in ("name", "stamp", "points", "status", "notes"):
+        for field in ("name", "stamp", "points", "status", "notes", "session"):
             assert getattr(again, field) == getattr(record, field)
         assert np.array_equal(again.hull, record.hull)
         assert again.hull.shape[1] == 2
@@ -220,7 +233,7 @@ def test_the_hull_is_well_known_text(tmp_path):
     path = tmp_path / "submaps.csv"
     write_submaps(path, [SubmapRecord("a", 0.0, 100, "ok", np.array([[0.0, 0], [1.5, 0], [0, 2]]))])
     polygon = "POLYGON ((0.000 0.000, 1.500 0.000, 0.000 2.000, 0.000 0.000))"
-    assert path.read_text().splitlines()[1] == f'a,0.0,100,ok,"{polygon}",'
+    assert path.read_text().splitlines()[1] == f'a,0.0,100,ok,"{polygon}",,'
 
 
 @pytest.mark.parametrize(

@@ -8,20 +8,33 @@ import pytest
 from conftest import BY_INLIERS, STRICT, with_match
 from scipy.ndimage import map_coordinates
 
+from terrainloop.config import Calibration
+from terrainloop.entry import MapEntry
 from terrainloop.features import Features
-from terrainloop.geometry import fit_se2, inverse, parameters_of, se2, se3, transform, yaw_of
+from terrainloop.geometry import fit_se2, inverse, parameters_of, se2, se3, transform, translation, yaw_of
 from terrainloop.gradient_map import GradientMap
+from terrainloop.matching.algorithm_1 import algorithm_1
 from terrainloop.matching.by_inliers import align
 from terrainloop.matching.correspondences import Associations, associate
-from terrainloop.matching.lift import covariance_of_inliers, lift_to_se3
-from terrainloop.entry import MapEntry
-from terrainloop.record import SubmapRecord
+from terrainloop.matching.lift import PlanarPrecision, covariance_of_inliers, lift_to_se3
+from terrainloop.matching.overlay import Overlay
 from terrainloop.matching.ransac import get_inliers, register_by_ransac, select_random_associations
 from terrainloop.matching.refine import refine
 from terrainloop.matching.register import compare, register
-from terrainloop.matching.ssd import compute_ssd, warp
+from terrainloop.matching.ssd import compute_ssd as ssd_of_overlay
+from terrainloop.record import SubmapRecord
 
 UTM = np.array([5e5, 4e6, 0.0])
+
+
+def compute_ssd(source, target, T):
+    return ssd_of_overlay(Overlay(source, target, T))
+
+
+def lift(source, target, T, pivot, covariance):
+    return lift_to_se3(Overlay(source, target, T), PlanarPrecision(pivot, covariance), Calibration())
+
+
 SHIFT = se3(*UTM, 0.0, 0.0, 0.0)
 
 
@@ -229,15 +242,22 @@ def test_maps_apart_share_nothing(world):
     assert ssd.value == 0.0
 
 
-def test_warp_puts_ground_where_the_transform_says(world):
+@pytest.mark.parametrize("step", [1, 3])
+def test_an_overlay_puts_ground_where_the_transform_says(world, step):
     T = se2(0.5, -0.8, np.pi / 2)
     source, target = square_map(world), square_map(world)
     spot = np.zeros(source.mask.shape, np.float32)
-    spot[12, 40] = 1.0
-    moved = warp(spot, source, target, T)
-    row, column = np.unravel_index(moved.argmax(), moved.shape)
-    x, y = transform(T, np.array(source.origin) + 0.1 * np.array([40, 12]))
-    assert target.origin + 0.1 * np.array([column, row]) == pytest.approx([x, y], abs=0.051)
+    spot[11:14, 39:42] = 1.0
+    overlay = Overlay(source, target, T, step)
+    values = overlay.of_source(spot)
+    spotted = overlay.positions[values > 0.99]
+    assert len(spotted) >= 1
+    expected = transform(T, np.array(source.origin) + 0.1 * np.array([40, 12]))
+    assert np.abs(spotted.mean(axis=0) - expected).max() < 0.051 * step
+    assert overlay.shared_area == pytest.approx(len(values) * (0.1 * step) ** 2)
+    np.testing.assert_array_equal(
+        overlay.of_target(target.elevation), target.elevation[::step, ::step][overlay.shared]
+    )
 
 
 # --- Algorithm 1
@@ -253,25 +273,6 @@ def noisy_associations(T, seed, good=25, bad=60, spread=0.04):
     return Associations(source[order], target[order])
 
 
-def algorithm_1(source, target, associations, draws, inlier_radius, accept):
-    """The paper's Algorithm 1, line by line, with the draws given."""
-    n, h, T = 0, None, None
-    for a, b in draws:
-        pair = [a, b]
-        if np.linalg.norm(associations.source[a] - associations.source[b]) <= inlier_radius:
-            continue  # not in the paper: two keypoints that close tell no rotation
-        T_i = fit_se2(associations.source[pair], associations.target[pair])
-        distances = np.linalg.norm(transform(T_i, associations.source) - associations.target, axis=1)
-        inliers = [k for k, distance in enumerate(distances) if distance <= inlier_radius]
-        if len(inliers) < 2:
-            continue
-        T_i = fit_se2(associations.source[inliers], associations.target[inliers])
-        h_i = compute_ssd(source, target, T_i)
-        if accept(h_i) and len(inliers) > n:
-            n, h, T = len(inliers), h_i, T_i
-    return SimpleNamespace(n=n, h=h, T=T)
-
-
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("max_ssd_ratio", [0.6, 100.0])
 def test_ransac_is_algorithm_1(world, seed, max_ssd_ratio):
@@ -280,7 +281,7 @@ def test_ransac_is_algorithm_1(world, seed, max_ssd_ratio):
     associations = noisy_associations(T, seed)
     # Only the naive loop's own cost keeps the draws few.
     draws = select_random_associations(len(associations), 150, np.random.default_rng(seed))
-    naive = algorithm_1(source, target, associations, draws.tolist(), 0.1, lambda h: h.ratio <= max_ssd_ratio)
+    naive = algorithm_1(source, target, associations, draws, 0.1, lambda n, h: h.ratio <= max_ssd_ratio)
     found = register_by_ransac(
         source,
         target,
@@ -461,7 +462,9 @@ def test_covariance_is_calibrated_over_many_places(world):
         estimate = fit_se2(keypoints, matched)
         moved = transform(estimate, keypoints)
         planar = covariance_of_inliers(moved - pivot, moved - matched, floor=1e-3)
-        lifted, covariance = lift_to_se3(source, target, estimate, pivot, planar)
+        lifted, covariance = lift_to_se3(
+            Overlay(source, target, estimate), PlanarPrecision(pivot, planar), Calibration()
+        )
         error = (parameters_of(lifted) - [0.5, -0.3, 0, 0, 0, 2.0])[[0, 1, 5]]
         planar = covariance[np.ix_([0, 1, 5], [0, 1, 5])]
         values.append(error @ np.linalg.solve(planar, error))
@@ -480,7 +483,7 @@ def test_lift_finds_height_and_tilt(world, tilt, yaw):
     seen = transform(inverse(T), np.c_[xy[1], world(0).height(xy[1])])
     source = GradientMap.from_points(seen, **options)
     planar = np.diag([0.01, 0.01, 0.01]) ** 2
-    lifted, covariance = lift_to_se3(source, target, se2(0.2, -0.1, yaw), np.array([0.3, 0.5]), planar)
+    lifted, covariance = lift(source, target, se2(0.2, -0.1, yaw), np.array([0.3, 0.5]), planar)
     # A tilt moves ground at height z sideways by z times the tilt, which the planar fit cannot tell.
     np.testing.assert_allclose(parameters_of(lifted)[[0, 1]], [0.2, -0.1], rtol=0, atol=0.05)
     assert parameters_of(lifted)[2] == pytest.approx(0.7, abs=0.005)
@@ -490,7 +493,9 @@ def test_lift_finds_height_and_tilt(world, tilt, yaw):
 
 def test_lift_without_shared_ground_leaves_height_and_tilt_open(world):
     T = se2(100.0, 0.0, 0.3)
-    lifted, covariance = lift_to_se3(world(0).map(), world(0).map(), T, np.ones(2), np.eye(3))
+    lifted, covariance = lift_to_se3(
+        Overlay(world(0).map(), world(0).map(), T), PlanarPrecision(np.ones(2), np.eye(3)), Calibration()
+    )
     np.testing.assert_allclose(lifted, se3(100.0, 0.0, 0.0, 0.0, 0.0, 0.3), rtol=0, atol=1e-12)
     assert np.isnan(covariance).all()
 
@@ -559,14 +564,17 @@ def test_utm_clouds_have_their_transform_in_their_own_frames(maps, either, name)
     assert far.overlap == pytest.approx(loop.overlap, abs=0.01)
 
 
-def test_utm_covariance_is_the_local_one_carried_along(maps, either):
-    """By finite differences of the transform between the frames that T_target_source undergoes."""
+def test_utm_covariance_is_about_stated_points_near_the_clouds(maps, either):
+    """By finite differences of the transform between frames that are moved to these points."""
     name = "same direction"
     loop = register(maps[name], maps["target"], either)
     far = register(maps["utm " + name], maps["utm target"], either)
+    assert not loop.source_origin.any()
+    assert not loop.target_origin.any()
+    to_source, to_target = (translation(origin - UTM) for origin in (far.source_origin, far.target_origin))
 
     def carried(parameters):
-        return parameters_of(SHIFT @ se3(*parameters) @ inverse(SHIFT))
+        return parameters_of(inverse(to_target) @ se3(*parameters) @ to_source)
 
     here, step = parameters_of(loop.T_target_source), 1e-6 * np.eye(6)
     jacobian = np.array([(carried(here + d) - carried(here - d)) / 2e-6 for d in step]).T
@@ -577,8 +585,19 @@ def test_utm_covariance_is_the_local_one_carried_along(maps, either):
         return covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
 
     np.testing.assert_allclose(correlation(far.covariance), correlation(expected), rtol=0, atol=0.1)
-    error = parameters_of(far.T_target_source) - carried(parameters_of(PLACES[name].T))
+    error = parameters_of(far.T_local) - carried(parameters_of(PLACES[name].T))
     assert (np.abs(error) < 5 * np.sqrt(np.diag(far.covariance))).all()
+    assert np.linalg.cond(far.covariance) < 1e8
+    np.linalg.cholesky(far.information("gtsam"))
+
+
+def test_the_local_transform_joins_the_stated_points(maps, either):
+    far = register(maps["utm same direction"], maps["utm target"], either)
+    points = UTM + np.random.default_rng(0).uniform(-3, 3, (20, 3))
+    expected = transform(far.T_target_source, points) - far.target_origin
+    np.testing.assert_allclose(
+        transform(far.T_local, points - far.source_origin), expected, rtol=0, atol=1e-6
+    )
 
 
 def test_register_gives_the_same_bytes_again(maps, either):
@@ -591,7 +610,8 @@ def test_register_gives_the_same_bytes_again(maps, either):
 def test_compare_is_register_of_what_is_mapped(maps, either):
     pair = {"b": maps["opposite direction"], "a": maps["target"]}
     known = compare(
-        *(MappedSubmap.of(name, gradient_map, either) for name, gradient_map in pair.items()), either
+        *(MapEntry.of(SubmapRecord(name), gradient_map, either) for name, gradient_map in pair.items()),
+        either,
     )
     loop = register(*pair.values(), either, names=("b", "a"))
     assert (known.source, known.target) == ("b", "a")
@@ -602,11 +622,14 @@ def test_compare_is_register_of_what_is_mapped(maps, either):
 def test_draws_hang_on_seed_and_names(maps):
     """Other draws, another subset of inliers perhaps; the same names and seed, the same draws."""
     few = with_match(BY_INLIERS, iterations=3)
-    source, target = (MappedSubmap.of("", maps[name], few) for name in ("same direction", "target"))
+    source, target = (MapEntry.of(SubmapRecord(""), maps[name], few) for name in ("same direction", "target"))
     associations = associate(source.features, target.features)
 
     def inliers(seed, names):
-        named = (replace(submap, name=name) for submap, name in zip((source, target), names, strict=True))
+        named = (
+            replace(entry, record=SubmapRecord(name))
+            for entry, name in zip((source, target), names, strict=True)
+        )
         found = align(*named, associations, few.model_copy(update={"seed": seed}))
         return b"" if found is None else found.inliers.tobytes()
 
@@ -635,7 +658,7 @@ def test_refinement_finds_the_pose_of_the_field(world, offset):
     target = world(0).map()
     T_world_source = se2(0.4, -0.3, 0.7)
     source = world(0).map(T_world_source)
-    refined = refine(source, target, se2(*offset) @ T_world_source).T_target_source
+    refined = refine(source, target, se2(*offset) @ T_world_source, Calibration()).T_target_source
     error = inverse(T_world_source) @ refined
     assert np.hypot(*error[:2, 2]) < 2e-3
     assert abs(yaw_of(error)) < 1e-3
@@ -648,11 +671,11 @@ def test_refinement_is_not_drawn_by_tilt_and_outliers(world):
     boulder = np.zeros(source.mask.shape, np.float32)
     boulder[20:26, 20:26] = 1.5
     disturbed = replace(source, gradient_x=source.gradient_x + 0.05 + boulder)
-    refined = refine(disturbed, target, se2(0.05, 0.05, 0.02) @ T_world_source).T_target_source
+    refined = refine(disturbed, target, se2(0.05, 0.05, 0.02) @ T_world_source, Calibration()).T_target_source
     error = inverse(T_world_source) @ refined
     assert np.hypot(*error[:2, 2]) < 1e-2
     assert abs(yaw_of(error)) < 5e-3
 
 
 def test_maps_that_share_nothing_are_not_refined(world):
-    assert refine(world(0).map(), world(0).map(), se2(100.0, 0.0, 0.3)) is None
+    assert refine(world(0).map(), world(0).map(), se2(100.0, 0.0, 0.3), Calibration()) is None

@@ -98,7 +98,7 @@ class Calibration(_Frozen):
     wraparound: float = Field(
         0.8, gt=0, le=1, description="search: FFT size, share of that without wrap-around"
     )
-    candidates: int = Field(11, ge=2, description="search: places whose surprisal is kept for the null")
+    candidates: int = Field(11, ge=1, description="search: places whose surprisal is kept for the null")
     dense_hypotheses: int = Field(2, ge=0, description="hypotheses of the search that are refined")
     sparse_hypotheses: int = Field(1, ge=0, description="hypotheses of the keypoints that are refined")
     ransac_hypotheses: int = Field(6, ge=0, description="largest inlier sets that are weighed")

@@ -66,7 +66,7 @@ def command(
     from terrainloop.io.trajectories import read_trajectory
 
     terminal = Terminal.open(as_json, quiet, verbose)
-    candidates, records = list(read_loops(run / "pairs.csv")), read_submaps(run / "submaps.csv")
+    candidates, records = read_loops(run / "pairs.csv"), read_submaps(run / "submaps.csv")
     poses = read_trajectory(truth).poses
     pairs = judge(
         candidates,

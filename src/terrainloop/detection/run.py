@@ -15,7 +15,7 @@ from terrainloop.config import Settings
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.kernel import Hyperparameters
-from terrainloop.io.results import LoopFile, read_loops, read_submaps, write_loops, write_submaps
+from terrainloop.io.results import LoopFile, iterate_loops, read_loops, read_submaps, write_loops, write_submaps
 from terrainloop.loop import LoopCandidate
 from terrainloop.record import SubmapRecord
 
@@ -77,7 +77,7 @@ class Run:
                 found="one whose pairs were not kept",
                 mend="give detect_mission an output",
             )
-        return read_loops(self.folder / PAIRS)
+        return iterate_loops(self.folder / PAIRS)
 
     @classmethod
     def read(cls, folder: Path | str) -> "Run":

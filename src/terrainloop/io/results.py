@@ -56,14 +56,13 @@ def write_loops(path: str | Path, candidates: Iterable[LoopCandidate]) -> None:
     _write_table(Path(path), _LOOP_COLUMNS, map(_loop_row, candidates))
 
 
-def read_loops(path: str | Path) -> Iterator[LoopCandidate]:
-    """Read what `write_loops` wrote, line by line.
+def read_loops(path: str | Path) -> list[LoopCandidate]:
+    """Read what `write_loops` wrote; raises `TerrainLoopError` naming file, line and column."""
+    return list(iterate_loops(path))
 
-    Raises
-    ------
-    TerrainLoopError
-        Naming file, line and column.
-    """
+
+def iterate_loops(path: str | Path) -> Iterator[LoopCandidate]:
+    """As `read_loops`, one at a time: pairs.csv may be larger than the memory."""
     return map(_candidate, _read_table(Path(path), _LOOP_COLUMNS, _LOOP_ADDED))
 
 

@@ -126,14 +126,14 @@ def covariance_of_inliers(matched: Array, residuals: Array, floor: float) -> Arr
 
 
 def _reach(gradient_map: GradientMap, position: Array) -> float:
-    """Distance from a position to the frame's origin, or to the point of the map nearest to it, metres.
+    """Distance from a position to the local origin, or to the point of the map nearest to it, metres.
 
     Over this distance a submap that is not rigid has accumulated its errors.
     """
     low = np.array(gradient_map.origin)
     rows, columns = gradient_map.mask.shape
-    anchor = np.clip(0.0, low, low + gradient_map.resolution * np.array([columns - 1, rows - 1]))
-    return float(np.hypot(*(position - anchor)))
+    high = low + gradient_map.resolution * np.array([columns - 1, rows - 1])
+    return float(np.hypot(*(position - np.clip(gradient_map.local_origin[:2], low, high))))
 
 
 def _at_local_origin(covariance: Array, arm: Array, yaw: float) -> Array:
