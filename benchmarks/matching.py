@@ -34,8 +34,9 @@ from threadpoolctl import threadpool_limits
 from terrainloop import Settings, Submap, __version__
 from terrainloop.detection.detector import fit_database, map_submap
 from terrainloop.detection.mission import _fit_mission
-from terrainloop.evaluation.judge import judge
 from terrainloop.evaluation.overlap import world_boxes
+from terrainloop.evaluation.pairs import evaluate_pairs
+from terrainloop.evaluation.truth import GroundTruth
 from terrainloop.geometry import inverse, parameters_of, yaw_of
 from terrainloop.io.missions import load_mission, read_sessions
 from terrainloop.io.results import submap_record
@@ -116,7 +117,7 @@ def judged(pool, folder, method):
         for i in range(len(poses))
         for j in range(i)
     }
-    return judge(candidates, records, poses, sessions), turned
+    return evaluate_pairs(candidates, GroundTruth(records, poses, sessions)), turned
 
 
 def recall(folders, _):
@@ -353,7 +354,7 @@ def sensors(_, __):
         low = np.maximum(boxes[:, None, :2], boxes[:, :2])
         shared = np.clip(np.minimum(boxes[:, None, 2:], boxes[:, 2:]) - low, 0, None).prod(axis=-1)
         seen = shared / (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)[:, None]
-        pairs = judge(candidates, records, np.array(poses))
+        pairs = evaluate_pairs(candidates, GroundTruth(records, np.array(poses)))
         halves = [p for p in pairs if seen[int(p.candidate.source), int(p.candidate.target)] > 0.5]
         found = [p for p in halves if p.candidate and p.pose_is_right]
         wrong = sum(bool(p.candidate) and not p.pose_is_right for p in pairs)

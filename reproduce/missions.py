@@ -123,7 +123,7 @@ class Drive:
         return [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]
 
     def pairs(self) -> list[tuple[int, int]]:
-        """Every (source, target) that is judged: source later, not consecutive, of another session."""
+        """Every (source, target) that is evaluated: source later, not consecutive, of another session."""
         return pairs_of(self.mission.names, self.sessions)
 
 

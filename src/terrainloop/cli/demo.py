@@ -30,7 +30,8 @@ def command(
 ) -> None:
     """Simulate a rover mission, find its loop closures, print the table, draw the pictures."""
     from terrainloop.config import Settings
-    from terrainloop.evaluation.judge import judge
+    from terrainloop.evaluation.pairs import evaluate_pairs
+    from terrainloop.evaluation.truth import MIN_OVERLAP, GroundTruth
     from terrainloop.io.missions import load_mission
     from terrainloop.simulation.missions import simulate_mission, write_mission
 
@@ -44,12 +45,12 @@ def command(
     write_mission(simulated, folder)
     mission, settings = load_mission(folder), Settings()
     detector, records = detect.run_detection(mission, settings, output, workers, terminal)
-    pairs = judge(detector.candidates, records, simulated.truth)
+    pairs = evaluate_pairs(detector.candidates, GroundTruth(records, simulated.truth))
     pictures = _draw(output, mission, detector, records)
     summary = detect.summarise(detector.candidates, records) | {
         "false_loops": sum(not pair.pose_is_right for pair in pairs if pair.candidate),
-        "true_pairs": sum(pair.overlap > 0.3 for pair in pairs),
-        "true_pairs_found": sum(pair.overlap > 0.3 for pair in pairs if pair.candidate),
+        "true_pairs": sum(pair.overlap > MIN_OVERLAP for pair in pairs),
+        "true_pairs_found": sum(pair.overlap > MIN_OVERLAP for pair in pairs if pair.candidate),
         "output": str(output),
         "pictures": [str(picture) for picture in pictures],
     }
@@ -58,7 +59,7 @@ def command(
         detect.show(console, detector, records, output)
         console.print(
             f"Against the truth: {summary['true_pairs_found']} of {summary['true_pairs']} pairs that share "
-            f"over 30 % of their ground found, {summary['false_loops']} false loops."
+            f"over {MIN_OVERLAP:.0%} of their ground found, {summary['false_loops']} false loops."
         )
         console.print("Pictures: " + ", ".join(summary["pictures"]))
 
