@@ -41,7 +41,8 @@ def box_iou(boxes: Array) -> Array:
     high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
     shared = np.clip(high - low, 0, None).prod(axis=-1)
     area = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)
-    return shared / (area[:, None] + area - shared)
+    union = area[:, None] + area - shared
+    return np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)
 
 
 def observed_iou(clouds: Sequence[Array], poses: Array, cell: float) -> Array:

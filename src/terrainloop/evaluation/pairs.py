@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from reprlib import repr as shown  # quotes a name, and cuts one that is too long for a message
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -191,7 +192,7 @@ def _check_pairs(pairs: Sequence[ScoredPair], truth: GroundTruth) -> None:
         if what is not None:
             raise TerrainLoopError(
                 expected=what[0],
-                found=f"{what[1]} for the pair {pair.source!r}, {pair.target!r}",
+                found=f"{what[1]} for the pair {shown(pair.source)}, {shown(pair.target)}",
                 mend="use pairs.csv and submaps.csv of one run, as 'terrainloop detect' wrote them",
             )
         seen.add(frozenset((pair.source, pair.target)))
@@ -202,9 +203,9 @@ def _fault_of(pair: ScoredPair, truth: GroundTruth, seen: set[frozenset[str]]) -
     T = np.asarray(pair.T_target_source)
     for name in (pair.source, pair.target):
         if name not in truth.index:
-            return "every submap of pairs.csv in submaps.csv", f"no {name!r}"
+            return "every submap of pairs.csv in submaps.csv", f"no {shown(name)}"
         if truth.records[truth.index[name]].status != "ok":
-            return "pairs of submaps that could be read", f"{name!r}, which is marked as broken,"
+            return "pairs of submaps that could be read", f"{shown(name)}, which is marked as broken,"
     if pair.source == pair.target:
         return "pairs of two different submaps", "one and the same submap"
     if frozenset((pair.source, pair.target)) in seen:

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from reprlib import repr as shown  # quotes a name, and cuts one that is too long for a message
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +55,7 @@ class GroundTruth:
         if absent:
             raise TerrainLoopError(
                 expected="a session for every submap in the sessions file",
-                found=f"none for {absent[0]!r}",
+                found=f"none for {shown(absent[0])}",
                 mend="add a line 'cloud,session' for each cloud of the run",
             )
 
@@ -102,14 +103,14 @@ def _check_records(records: Sequence[SubmapRecord]) -> None:
     if repeated:
         raise TerrainLoopError(
             expected="every submap once in submaps.csv",
-            found=f"{repeated[0]!r} {names[repeated[0]]} times",
+            found=f"{shown(repeated[0])} {names[repeated[0]]} times",
             mend="use the file as 'terrainloop detect' wrote it",
         )
     for record in records:
         if record.status == "ok" and not _has_area(record.hull):
             raise TerrainLoopError(
                 expected="a hull of three or more finite corners that enclose an area, for each submap",
-                found=f"{np.asarray(record.hull).tolist()} for {record.name!r}"[:120],
+                found=f"{shown(record.hull.tolist())} for {shown(record.name)}",
                 mend="use submaps.csv as 'terrainloop detect' wrote it",
             )
 
@@ -132,14 +133,14 @@ def _check_poses(poses: Array, records: Sequence[SubmapRecord]) -> None:
         if not is_rigid(pose):
             raise TerrainLoopError(
                 expected="true poses with a rotation and finite coordinates below 1e9 m",
-                found=f"no such pose for {record.name!r}",
+                found=f"no such pose for {shown(record.name)}",
                 mend="correct that line of the truth",
             )
         if pose[2, 2] < np.cos(MAX_TILT):
             raise TerrainLoopError(
                 expected="true poses of gravity-aligned frames, z up",
                 found=f"a tilt of {np.degrees(np.arccos(np.clip(pose[2, 2], -1, 1))):.0f} deg "
-                f"for {record.name!r}",
+                f"for {shown(record.name)}",
                 mend="write quaternions as qx qy qz qw, w last, and poses of the submaps' own frames",
             )
 
