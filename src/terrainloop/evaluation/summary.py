@@ -218,10 +218,9 @@ def evaluate_run(
 
 def _read_run(run: Path) -> tuple[Settings, list[SubmapRecord], list[LoopCandidate]]:
     """The one place that knows how a run is stored."""
-    records = read_submaps(run / "submaps.csv")
     with np.errstate(invalid="ignore"):  # an infinite angle is refused when its pair is evaluated
         candidates = read_loops(run / "pairs.csv")
-    return Settings.from_yaml(run / "config.yaml"), records, candidates
+    return Settings.from_yaml(run / "config.yaml"), read_submaps(run / "submaps.csv"), candidates
 
 
 def _observed_overlap(folder: Path, truth: GroundTruth) -> Array:
