@@ -442,11 +442,11 @@ def test_evaluate_by_the_ground_observed(ok, run, mission_folder):
 def test_evaluate_leads_with_what_is_right(ok, run, mission_folder, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     text = in_one_line(ok("evaluate", run, "--truth", mission_folder / "truth.tum"))
-    assert text.startswith("1 loop accepted: 1 with the right pose, 0 with a wrong one (tolerance ")
-    assert "(bounding-box IoU), 1 of 1 found; 1 of 1 revisit closed by at least one right loop." in text
+    assert text.startswith("1 loop accepted: 1 right, 0 wrong by pose (within 0.")
+    assert "Found 1 of 1 pair that share over 30 % of their ground (bounding-box IoU). Closed 1 of 1" in text
     assert "R@1 1.00 (1 of 1), P@1 1.00 (1 of 1)" in text
-    assert "100.0 % within 2 m and 5 deg, 100.0 % with yaw within 10 deg" in text
-    assert "4 pairs evaluated; 2 left out that odometry already connects" in text
+    assert "Within 2 m and 5 deg: 100.0 % of the accepted loops; yaw within 10 deg: 100.0 %" in text
+    assert "4 pairs evaluated; 2 left out: consecutive submaps." in text
     assert text.index("right by") > text.index("precision by pose") > text.index("R@1")
     assert ok("evaluate", run, "--truth", mission_folder / "truth.tum", "-q") == ""
 

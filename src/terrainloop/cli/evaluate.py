@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -89,39 +89,52 @@ def show(console: Console, evaluation: "Evaluation") -> None:
 
 def _sentences(evaluation: "Evaluation") -> list[str]:
     """The answer first: how many loops are right, what was found, how good the poses are."""
+    result, tolerance = evaluation.as_dict(), evaluation.tolerance
     left_out = (
-        f"{count_of(len(evaluation.pairs), 'pair')} evaluated; {evaluation.left_out} left out that odometry "
-        "already connects (consecutive submaps" + (", one session)." if evaluation.truth.sessions else ").")
+        f"{count_of(result['pairs'], 'pair')} evaluated; {result['pairs_left_out']} left out: consecutive "
+        "submaps" + (" or one session." if evaluation.truth.sessions else ".")
     )
     if not evaluation.pairs:
         return [f"Nothing to evaluate: {left_out}"]
-    result, tolerance = evaluation.as_dict(), evaluation.tolerance
     sentences = [
-        f"{count_of(result['accepted'], 'loop')} accepted: {result['accepted_right_pose']} with the right "
-        f"pose, {result['accepted_wrong_pose']} with a wrong one "
-        f"(tolerance {tolerance.position:g} m, {math.degrees(tolerance.yaw):g} deg)."
+        f"{count_of(result['accepted'], 'loop')} accepted: {result['accepted_right_pose']} right, "
+        f"{result['accepted_wrong_pose']} wrong by pose (within {tolerance.position:g} m and "
+        f"{math.degrees(tolerance.yaw):g} deg).",
+        *_retrieval_sentences(evaluation),
     ]
-    for row in result["retrieval"]:
-        sentences += [
-            f"Of the pairs that share more than {100 * evaluation.min_overlap:g} % of their ground "
-            f"({OVERLAPS[row['truth']]}), {row['true_pairs_found']} of {row['true_pairs']} found; "
-            f"{row['closed']} of {count_of(row['revisits'], 'revisit')} closed by at least one right loop.",
-            f"Best match per query: R@1 {_ratio(row['recall_at_one'], row['right_at_one'], row['queries'])}, "
-            f"P@1 {_ratio(row['precision_at_one'], row['answered_right'], row['answered'])}.",
-        ]
     if result["accepted"]:
         sentences.append(
-            f"Of the accepted loops, {100 * result['share_within_2m_5deg']:.1f} % within 2 m and 5 deg, "
-            f"{100 * result['share_yaw_within_10deg']:.1f} % with yaw within 10 deg."
+            f"Within 2 m and 5 deg: {100 * result['share_within_2m_5deg']:.1f} % of the accepted loops; "
+            f"yaw within 10 deg: {100 * result['share_yaw_within_10deg']:.1f} %."
         )
     if result["accepted_right_pose"]:
         sentences.append(
-            "Median error of the right loops: "
-            f"{result['right_pose_median_position_error_m']:.3f} m horizontally, "
+            f"Median error of the right loops: {result['right_pose_median_position_error_m']:.3f} m, "
             f"{result['right_pose_median_height_error_m']:.3f} m in height, "
             f"{result['right_pose_median_yaw_error_deg']:.2f} deg of yaw."
         )
     return [*sentences, left_out]
+
+
+def _retrieval_sentences(evaluation: "Evaluation") -> list[str]:
+    """What was found and closed, by bounding boxes and, where clouds were given, by the observed ground."""
+    box, *observed = evaluation.as_dict()["retrieval"]
+    at_one = _ratio(box["precision_at_one"], box["answered_right"], box["answered"])
+    return [
+        f"Found {box['true_pairs_found']} of {count_of(box['true_pairs'], 'pair')} that share over "
+        f"{100 * evaluation.min_overlap:g} % of their ground ({OVERLAPS['box']}).",
+        f"Closed {box['closed']} of {count_of(box['revisits'], 'revisit')} by at least one right loop.",
+        f"Best match per query: R@1 {_recall_at_one(box)}, P@1 {at_one}.",
+        *(
+            f"By {OVERLAPS['observed']}: found {row['true_pairs_found']} of {row['true_pairs']}, "
+            f"closed {row['closed']} of {row['revisits']}, R@1 {_recall_at_one(row)}."
+            for row in observed
+        ),
+    ]
+
+
+def _recall_at_one(row: dict[str, Any]) -> str:
+    return _ratio(row["recall_at_one"], row["right_at_one"], row["queries"])
 
 
 def _show_table(console: Console, evaluation: "Evaluation") -> None:

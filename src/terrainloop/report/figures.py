@@ -136,15 +136,15 @@ def figure_precision_recall(evaluation: Evaluation) -> Figure:
     curve, by_threshold = figure.subplots(1, 2)
     true = evaluation.metrics["box", "pose"].true_pairs
     figure.suptitle(
-        f"{true} true pairs (bounding-box IoU > {evaluation.min_overlap:g}); "
-        f"{len(evaluation.loops)} loops accepted, {len(evaluation.right_loops)} with the right pose"
+        f"{len(evaluation.loops)} loops accepted, {len(evaluation.right_loops)} with the right pose; "
+        f"{true} true pairs (bounding-box IoU > {evaluation.min_overlap:g}), {evaluation.found()} found"
     )
     _draw_curves(curve, evaluation)
     _draw_thresholds(by_threshold, evaluation)
     for axes in (curve, by_threshold):
         axes.set_ylim(-0.03, 1.03)
         axes.grid(alpha=0.3)
-        axes.legend(loc="lower left", fontsize=8)
+        axes.legend(loc="best", fontsize=8)
     return figure
 
 
