@@ -525,6 +525,50 @@ def test_everything_of_a_run(tmp_path):
     )
 
 
+def chain(count, spacing=3.0):
+    """Submaps of 2 m in a row, too far apart to share ground, and their poses."""
+    poses = np.array([se3(spacing * i, 0, 0, 0, 0, 0) for i in range(count)])
+    return [record(f"s{i}", SQUARE) for i in range(count)], poses
+
+
+@pytest.mark.parametrize(
+    ("error", "within", "yaw_within"),
+    [
+        (se3(1.9, 0, 0, 0, 0, 0), 1, 1),
+        (se3(2.1, 0, 0, 0, 0, 0), 0, 1),
+        (se3(1.5, 0, 1.5, 0, 0, 0), 0, 1),  # 2.1 m in space
+        (se3(0, 0, 0, 0, 0, np.radians(4.9)), 1, 1),
+        (se3(0, 0, 0, 0, 0, np.radians(5.1)), 0, 1),
+        (se3(0, 0, 0, np.radians(5.1), 0, 0), 0, 1),
+        (se3(0, 0, 0, 0, 0, np.radians(-9.9)), 0, 1),
+        (se3(0, 0, 0, 0, 0, np.radians(10.1)), 0, 0),
+    ],
+)
+def test_shares_that_others_report(tmp_path, error, within, yaw_within):
+    """The error is one at the middle of the source; a second loop is far off."""
+    records, poses = chain(3)
+    pairs = [candidate("s2", "s0", inverse(poses[0]) @ poses[2] @ error)]
+    result = evaluate_run(tmp_path, write_run(tmp_path, pairs, records, poses)).as_dict()
+    assert (result["share_within_2m_5deg"], result["share_yaw_within_10deg"]) == (within, yaw_within)
+
+
+def test_pairs_by_bands_of_overlap(tmp_path):
+    """Squares of 2 m at distance d share (2 - d) / (2 + d)."""
+    overlaps = [0.05, 0.1 + 1e-6, 0.2, 0.3 - 1e-6, 0.3 + 1e-6, 0.6, 1.0, 0.0]
+    distances = [2 * (1 - o) / (1 + o) for o in overlaps]
+    others, lonely = chain(2 * len(overlaps), spacing=100.0)
+    poses = lonely.copy()
+    poses[1::2, :2, 3] = poses[0, :2, 3] + np.c_[distances, np.zeros(len(overlaps))]
+    pairs = [
+        candidate(f"s{i}", "s0", inverse(poses[0]) @ poses[i], score=float(i))
+        for i in range(3, len(poses), 2)
+    ]
+    result = evaluate_run(tmp_path, write_run(tmp_path, pairs, others, poses)).as_dict()
+    assert result["pairs_by_overlap"] == {"0.1-0.3": 3, "0.3-1": 3}
+    assert (result["true_pairs"], result["disjoint_pairs"]) == (3, 1)
+    assert result["recall_before_first_disjoint"] == {"0.1-0.3": 0.0, "0.3-1": 0.0}  # the last scores most
+
+
 def test_a_right_pose_on_little_overlap_is_right_by_pose(tmp_path):
     """A perfect run is not called wrong because a pair shares less than the paper asks for."""
     poses = POSES.copy()
@@ -577,7 +621,8 @@ def test_inverse_poses_are_noticed(tmp_path):
 
 
 def test_wrong_loops_are_not_taken_for_inverse_poses(tmp_path):
-    pairs = [wrong("d", "a"), wrong("d", "b"), wrong("e", "a"), right("e", "b")]
+    inverted = candidate("d", "b", POSES[1] @ inverse(POSES[3]))
+    pairs = [wrong("d", "a"), inverted, wrong("e", "a"), right("e", "b")]
     result = evaluate_run(tmp_path, write_run(tmp_path, pairs)).as_dict()
     assert (result["accepted_right_pose"], result["accepted_wrong_pose"]) == (1, 3)
 

@@ -63,12 +63,12 @@ class Terminal:
         if self.as_json:
             typer.echo(json.dumps(_plain(value), indent=2, allow_nan=False))
         elif not self.quiet:
-            show(_WideConsole(highlight=False))
+            show(_WideConsole(highlight=False, markup=False))
 
     def say(self, text: str) -> None:
         """A remark on stderr."""
         if not self.quiet:
-            Console(stderr=True, highlight=False).print(text)
+            Console(stderr=True, highlight=False, markup=False).print(text)
 
     @contextmanager
     def progress(self) -> Iterator[Callable[[str, int, int], None]]:

@@ -91,7 +91,7 @@ class GroundTruth:
             Use the overlap of the observed ground instead of that of the bounding boxes.
         """
         overlap = self.observed if observed and self.observed is not None else self.box_overlap
-        later, earlier = np.nonzero(np.tril(overlap > min_overlap, k=-2))
+        later, earlier = np.nonzero(np.tril(overlap > min_overlap, k=-1))
         return np.unique(
             [i for i, j in zip(later.tolist(), earlier.tolist(), strict=True) if not self.are_connected(i, j)]
         ).astype(np.intp)
