@@ -36,6 +36,7 @@ from terrainloop.detection.detector import fit_database, map_submap
 from terrainloop.detection.mission import _fit_mission
 from terrainloop.evaluation.overlap import world_boxes
 from terrainloop.evaluation.pairs import evaluate_pairs
+from terrainloop.evaluation.summary import OVERLAP_BANDS
 from terrainloop.evaluation.truth import GroundTruth
 from terrainloop.geometry import inverse, parameters_of, yaw_of
 from terrainloop.io.missions import load_mission, read_sessions
@@ -50,7 +51,7 @@ from terrainloop.simulation.paths import revisiting_path
 from terrainloop.simulation.terrain import make_terrain
 
 CACHE = Path.home() / ".cache" / "terrainloop-benchmarks"
-BANDS = ((0.3, 1.0), (0.1, 0.3))
+BANDS = OVERLAP_BANDS[::-1]
 EVIDENCE = Settings()
 INLIERS = Settings.model_validate({"match": {"decision": "inliers"}})
 # What proposes, and what decides: the dense places, the inlier sets looked at, the settings.

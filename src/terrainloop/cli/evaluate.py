@@ -33,7 +33,7 @@ def command(
         typer.Option(
             "--position-tolerance",
             help="Horizontal error, in metres, below which a pose is right. "
-            "Default: 1 m, but 2 % to 10 % of the size of the submaps.",
+            "Default: 1 m, bounded by 2 % and 10 % of the size of the submaps.",
         ),
     ] = None,
     yaw_tolerance: Annotated[
