@@ -294,6 +294,7 @@ def test_metrics_without_true_pairs_are_no_numbers(count):
     metrics = measure(np.arange(count), np.zeros(count), np.zeros((count, 2)))
     assert (metrics.pairs, metrics.true_pairs) == (count, 0)
     assert np.isnan([astuple(e) for e in (metrics.recall_at_full_precision, metrics.average_precision)]).all()
+    assert str(metrics.max_f1) == "-"
 
 
 def test_a_method_that_compares_nothing_finds_nothing():
