@@ -23,7 +23,6 @@ from functools import lru_cache
 from itertools import combinations
 from multiprocessing import get_context
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import patch
 
 import cv2
@@ -36,8 +35,10 @@ from threadpoolctl import threadpool_limits
 from terrainloop import Settings, Submap, __version__
 from terrainloop.detection.detector import fit_database, map_submap
 from terrainloop.detection.mission import _fit_mission
-from terrainloop.evaluation.judge import judge
 from terrainloop.evaluation.overlap import world_boxes
+from terrainloop.evaluation.pairs import evaluate_pairs
+from terrainloop.evaluation.summary import OVERLAP_BANDS
+from terrainloop.evaluation.truth import GroundTruth
 from terrainloop.geometry import inverse, parameters_of, yaw_of
 from terrainloop.io.missions import load_mission, read_sessions
 from terrainloop.io.trajectories import read_trajectory
@@ -49,8 +50,8 @@ from terrainloop.simulation.odometry import estimate, true_poses
 from terrainloop.simulation.paths import revisiting_path
 from terrainloop.simulation.terrain import make_terrain
 
-CACHE = Path.home() / ".cache" / "terrainloop-benchmarks-new"
-BANDS = ((0.3, 1.0), (0.1, 0.3))
+CACHE = Path.home() / ".cache" / "terrainloop-benchmarks"
+BANDS = OVERLAP_BANDS[::-1]
 EVIDENCE = Settings()
 INLIERS = Settings.model_validate({"match": {"decision": "inliers"}})
 
@@ -120,7 +121,7 @@ def judged(pool, folder, method):
         for i in range(len(poses))
         for j in range(i)
     }
-    return judge(candidates, records, poses, sessions), turned
+    return evaluate_pairs(candidates, GroundTruth(records, poses, sessions)), turned
 
 
 def recall(folders, _):
@@ -307,12 +308,8 @@ def query_time(folders, _):
         with ExitStack() as stack:
             for module, name in stages:
                 label = f"{module.__name__.rpartition('.')[2]}.{name}"
-                whole = getattr(module, name)
-                if name == "Query":
-                    whole = SimpleNamespace(of=timed(label, whole.of))
-                else:
-                    whole = timed(label, whole)
-                stack.enter_context(patch.object(module, name, whole))
+                owner, attribute = (module.Query, "of") if name == "Query" else (module, name)
+                stack.enter_context(patch.object(owner, attribute, timed(label, getattr(owner, attribute))))
             compare_many(query, stored, EVIDENCE, pairs=105)
     for name, seconds in spent.items():
         print(f"  {name}: {1e3 * seconds / len(stored):.2f} ms per pair")
@@ -357,7 +354,7 @@ def sensors(_, __):
         low = np.maximum(boxes[:, None, :2], boxes[:, :2])
         shared = np.clip(np.minimum(boxes[:, None, 2:], boxes[:, 2:]) - low, 0, None).prod(axis=-1)
         seen = shared / (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)[:, None]
-        pairs = judge(candidates, records, np.array(poses))
+        pairs = evaluate_pairs(candidates, GroundTruth(records, np.array(poses)))
         halves = [p for p in pairs if seen[int(p.candidate.source), int(p.candidate.target)] > 0.5]
         found = [p for p in halves if p.candidate and p.pose_is_right]
         wrong = sum(bool(p.candidate) and not p.pose_is_right for p in pairs)

@@ -172,13 +172,13 @@ def curves(by_mission: Mapping[str, Sequence[Result]], modules: Sequence[str], o
     """As the paper has them, and where a match is right only with its pose."""
     methods = dict.fromkeys(r.method for results in by_mission.values() for r in results)
     looks = figures.looks_of(list(methods))
-    for reading, stem in (("overlap", name), ("pose", f"{name}_pose")):
+    for criterion, stem in (("overlap", name), ("pose", f"{name}_pose")):
         chosen = {
-            mission: best_of_each([r for r in results if r.module in modules], reading)
+            mission: best_of_each([r for r in results if r.module in modules], criterion)
             for mission, results in by_mission.items()
         }
-        title = f"A match is right by {reading}. Of each baseline the best settings on each mission"
-        figures.precision_recall_curves(chosen, reading, looks, title).save(out, stem)
+        title = f"A match is right by {criterion}. Of each baseline the best settings on each mission"
+        figures.precision_recall_curves(chosen, criterion, looks, title).save(out, stem)
 
 
 def example_of(results: Sequence[Result]) -> Result | None:

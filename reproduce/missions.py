@@ -14,8 +14,8 @@ from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.baselines.method import Observation, Scale
 from terrainloop.evaluation.overlap import ground_cell, observed_iou
 from terrainloop.io.missions import Mission, load_mission, read_sessions
-from terrainloop.record import SubmapRecord
 from terrainloop.io.trajectories import Trajectory, write_tum
+from terrainloop.record import SubmapRecord
 from terrainloop.simulation.missions import SimulatedMission, simulate_mission, write_mission
 from terrainloop.simulation.rendering import colours_of, images_of
 from terrainloop.submap import Submap
@@ -123,7 +123,7 @@ class Drive:
         return [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]
 
     def pairs(self) -> list[tuple[int, int]]:
-        """Every (source, target) that is judged: source later, not consecutive, of another session."""
+        """Every (source, target) that is evaluated: source later, not consecutive, of another session."""
         return pairs_of(self.mission.names, self.sessions)
 
 

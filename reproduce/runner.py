@@ -88,7 +88,7 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A pair as a method scored it; what `terrainloop.evaluation.judge` takes."""
+    """A pair as a method scored it; what `terrainloop.evaluation.pairs` takes."""
 
     source: str
     target: str

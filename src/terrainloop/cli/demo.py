@@ -39,7 +39,8 @@ def command(
     """Simulate a rover mission, find its loop closures, print the table, draw the pictures."""
     from terrainloop.config import Settings
     from terrainloop.detection.mission import detect_mission
-    from terrainloop.evaluation.judge import judge
+    from terrainloop.evaluation.pairs import evaluate_pairs
+    from terrainloop.evaluation.truth import MIN_OVERLAP, GroundTruth
     from terrainloop.io.missions import load_mission
     from terrainloop.simulation.missions import simulate_mission, write_mission
 
@@ -58,12 +59,12 @@ def command(
             mission, settings, output=output, workers=worker_count(workers), on_progress=progress
         )
     candidates = list(run.pairs())
-    pairs = judge(candidates, run.submaps, simulated.truth)
+    pairs = evaluate_pairs(candidates, GroundTruth(run.submaps, simulated.truth))
     pictures = _draw(output, mission, run, max(candidates, key=lambda candidate: candidate.score))
     summary = detect.summarise(run) | {
         "false_loops": sum(not pair.pose_is_right for pair in pairs if pair.candidate),
-        "true_pairs": sum(pair.overlap > 0.3 for pair in pairs),
-        "true_pairs_found": sum(pair.overlap > 0.3 for pair in pairs if pair.candidate),
+        "true_pairs": sum(pair.overlap > MIN_OVERLAP for pair in pairs),
+        "true_pairs_found": sum(pair.overlap > MIN_OVERLAP for pair in pairs if pair.candidate),
         "pictures": [str(picture) for picture in pictures],
     }
 
@@ -71,7 +72,7 @@ def command(
         detect.show(console, run)
         console.print(
             f"Against the ground truth: {summary['true_pairs_found']} of {summary['true_pairs']} pairs that "
-            f"share over 30 % of their ground found, {summary['false_loops']} false loops."
+            f"share over {MIN_OVERLAP:.0%} of their ground found, {summary['false_loops']} false loops."
         )
         console.print("Pictures: " + ", ".join(summary["pictures"]), markup=False)
 

@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.cells import cell_len
 from rich.console import Console
 from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
 from terrainloop.errors import TerrainLoopError
 
@@ -42,6 +44,13 @@ WorkersOption = Annotated[
 ]
 
 
+class _WideConsole(Console):
+    """A console that lets a table run over the edge; Rich crops it, and with it numbers."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        super().print(*objects, **{"crop": False, **options})
+
+
 @dataclass(frozen=True)
 class Terminal:
     """Where a command writes: results to stdout, the rest to stderr."""
@@ -62,12 +71,12 @@ class Terminal:
         if self.as_json:
             typer.echo(json.dumps(_plain(value), indent=2, allow_nan=False))
         elif not self.quiet:
-            show(Console(highlight=False))
+            show(_WideConsole(highlight=False, markup=False))
 
     def say(self, text: str) -> None:
         """A remark on stderr."""
         if not self.quiet:
-            Console(stderr=True, highlight=False).print(text)
+            Console(stderr=True, highlight=False, markup=False).print(text)
 
     @contextmanager
     def progress(self) -> Iterator[Callable[[str, int, int], None]]:
@@ -95,12 +104,13 @@ def _plain(value: Any) -> Any:
 
 
 def table_of(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """A table with its columns to the right, as numbers are read."""
-    table = Table(title=title, title_justify="left", show_edge=False, pad_edge=False)
-    for column in columns:
-        table.add_column(column, justify="right", no_wrap=True)
+    """A right-aligned table that never cuts a cell: where it is too wide, headers wrap, then it overflows."""
+    table = Table(title=Text(title), title_justify="left", show_edge=False, pad_edge=False)
+    for index, column in enumerate(columns):
+        least = max(map(cell_len, [*column.split(), *(row[index] for row in rows)]), default=1)
+        table.add_column(Text(column), justify="right", overflow="fold", min_width=least)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(Text, row))
     return table
 
 

@@ -15,7 +15,14 @@ from terrainloop.config import Settings
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.kernel import Hyperparameters
-from terrainloop.io.results import LoopFile, iterate_loops, read_loops, read_submaps, write_loops, write_submaps
+from terrainloop.io.results import (
+    LoopFile,
+    iterate_loops,
+    read_loops,
+    read_submaps,
+    write_loops,
+    write_submaps,
+)
 from terrainloop.loop import LoopCandidate
 from terrainloop.record import SubmapRecord
 
@@ -89,6 +96,13 @@ class Run:
             If a file is missing or damaged.
         """
         folder = Path(folder)
+        missing = [name for name in (LOOPS, PAIRS, SUBMAPS, CONFIG) if not (folder / name).is_file()]
+        if missing:
+            raise TerrainLoopError(
+                expected=f"the results of a run in {folder}",
+                found=f"no {', '.join(missing)}",
+                mend="give the output folder of 'terrainloop detect'",
+            )
         about = _read_about(folder / RUN)
         kept = about.get("hyperparameters")
         return cls(

@@ -1,7 +1,6 @@
 """The paper's pictures: a gradient map in the making, two maps matched, precision and recall."""
 
-from collections.abc import Mapping, Sequence
-from itertools import cycle
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from terrainloop.config import Settings
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
-from terrainloop.evaluation.precision_recall import OperatingPoint
+from terrainloop.evaluation.summary import Evaluation
 from terrainloop.geometry import Array, se2, transform, yaw_of
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
@@ -25,6 +24,11 @@ from terrainloop.submap import Submap
 
 SOURCE_COLOUR, TARGET_COLOUR = "#d1495b", "#00798c"
 DRAWN_POINTS = 40_000  # more do not show at this size
+_CRITERION_STYLES = {  # thinner over thicker, where curves coincide
+    "pose": (TARGET_COLOUR, 4.0),
+    "overlap and pose": ("#edae49", 2.4),
+    "overlap": ("0.1", 0.9),
+}
 
 
 def figure_map(submap: Submap, gradient_map: GradientMap) -> Figure:
@@ -123,47 +127,64 @@ def figure_mission(
     return figure
 
 
-def figure_precision_recall(
-    points: Sequence[OperatingPoint],
-    title: str,
-    threshold: str,
-    curves: Mapping[str, Sequence[OperatingPoint]],
-) -> Figure:
-    """Precision against recall, and both against the threshold, named so (paper, Figs. 8 and 9).
+def figure_precision_recall(evaluation: Evaluation) -> Figure:
+    """Precision against recall, and both against the threshold (paper, Figs. 8 and 9), foremost by pose.
 
-    Parameters
-    ----------
-    points : sequence of OperatingPoint
-        At a few thresholds, told beside them.
-    title, threshold : str
-    curves : mapping of str to sequence of OperatingPoint
-        Each by its name, at every distinct score from high to low; drawn in steps, so that the area
-        beneath is the average precision.
+    The curves have a step at every distinct score, so that the area beneath is the average precision; the
+    cross marks the accepted loops.
     """
-    figure = Figure(figsize=(10, 4.5), layout="constrained")
+    figure = Figure(figsize=(10, 4.6), layout="constrained")
     curve, by_threshold = figure.subplots(1, 2)
-    recall, precision = [p.recall for p in points], [p.precision for p in points]
-    thresholds = [p.threshold for p in points]
-    looks = cycle([(TARGET_COLOUR, 4.0), (SOURCE_COLOUR, 2.2), ("0.1", 0.9)])  # thinner over thicker
-    for (name, steps), (colour, width) in zip(curves.items(), looks, strict=False):
-        start = [(0.0, p.precision) for p in steps[:1]]
-        drawn = np.array([*start, *((p.recall, p.precision) for p in steps)]).reshape(-1, 2)
-        curve.plot(*drawn.T, color=colour, linewidth=width, drawstyle="steps-pre", label=name)
-    curve.plot(recall, precision, "o", color=TARGET_COLOUR, markersize=4)
-    for point in points:
-        curve.annotate(f"{point.threshold:g}", (point.recall, point.precision), fontsize=7)
-    curve.set(xlabel="recall", ylabel="precision", title=title)
-    if curves:
-        curve.legend(loc="lower left", fontsize=7)
-    by_threshold.plot(thresholds, precision, "o-", color=TARGET_COLOUR, markersize=4, label="precision")
-    by_threshold.plot(thresholds, recall, "s--", color=SOURCE_COLOUR, markersize=4, label="recall")
-    by_threshold.set(xlabel=threshold, title="over the threshold")
-    by_threshold.legend()
+    true = evaluation.metrics["box", "pose"].true_pairs
+    figure.suptitle(
+        f"{len(evaluation.loops)} loops accepted, {len(evaluation.right_loops)} with the right pose; "
+        f"{true} true pairs (bounding-box IoU > {evaluation.min_overlap:g}), {evaluation.found()} found"
+    )
+    _draw_curves(curve, evaluation)
+    _draw_thresholds(by_threshold, evaluation)
     for axes in (curve, by_threshold):
         axes.set_ylim(-0.03, 1.03)
         axes.grid(alpha=0.3)
-    curve.set_xlim(-0.03, 1.03)
+        axes.legend(loc="best", fontsize=8)
     return figure
+
+
+def _draw_curves(axes: Axes, evaluation: Evaluation) -> None:
+    for name, (colour, width) in _CRITERION_STYLES.items():
+        steps = evaluation.criteria["box", name].curve()
+        drawn = [(0.0, p.precision) for p in steps[:1]] + [(p.recall, p.precision) for p in steps]
+        label = f"right by {name}: AP {evaluation.metrics['box', name].average_precision}"
+        recall, precision = np.reshape(drawn, (-1, 2)).T
+        axes.plot(recall, precision, color=colour, linewidth=width, drawstyle="steps-pre", label=label)
+    found, true = evaluation.found(), evaluation.metrics["box", "pose"].true_pairs
+    wrong = len(evaluation.loops) - len(evaluation.right_loops)
+    if true and found + wrong:
+        accepted = found / true, found / (found + wrong)
+        mark: dict[str, Any] = {
+            "color": SOURCE_COLOUR,
+            "markersize": 9,
+            "markeredgewidth": 2.2,
+            "clip_on": False,
+            "zorder": 5,
+        }
+        axes.plot(accepted[0], accepted[1], "x", label="accepted loops, by pose", **mark)
+    axes.set(xlabel="recall", ylabel="precision", xlim=(-0.03, 1.03))
+
+
+def _draw_thresholds(axes: Axes, evaluation: Evaluation) -> None:
+    thresholds = range(len(evaluation.table))  # evenly spaced, since they grow faster than linearly
+    lines: list[tuple[str, str, dict[str, Any]]] = [
+        ("pose_precision", "precision by pose", {"color": TARGET_COLOUR, "marker": "o", "linewidth": 4.0}),
+        ("pose_recall", "recall by pose", {"color": SOURCE_COLOUR, "marker": "s", "linewidth": 2.0}),
+        ("precision", "precision by overlap", {"color": "0.1", "linewidth": 0.9}),
+        ("recall", "recall by overlap", {"color": "0.1", "linewidth": 0.9, "linestyle": "--"}),
+    ]
+    for key, label, style in lines:
+        values = [row[key] for row in evaluation.table]
+        axes.plot(thresholds, values, label=label, markersize=4, **style)
+    name = f"min_{evaluation.score_name}"
+    axes.set_xticks(thresholds, [str(row[name]) for row in evaluation.table])
+    axes.set(xlabel=f"minimum {evaluation.score_name}", ylabel="precision, recall")
 
 
 def save_figure(figure: Figure, path: Path) -> None:
