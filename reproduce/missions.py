@@ -1,5 +1,6 @@
 """The missions: simulated stand-ins for the paper's, others beyond it, and real ones where given."""
 
+import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,14 +11,16 @@ import cv2
 import numpy as np
 import yaml
 
+from benchmarks.provenance import fingerprint
+from reproduce.appearance.rendering import colours_of, images_of
+from reproduce.baselines.method import Observation, Scale
+from reproduce.kept import code_key, is_current
 from terrainloop.errors import TerrainLoopError
-from terrainloop.evaluation.baselines.method import Observation, Scale
 from terrainloop.evaluation.overlap import ground_cell, observed_iou
 from terrainloop.io.missions import Mission, load_mission, read_sessions
 from terrainloop.io.results import SubmapRecord, submap_record
 from terrainloop.io.trajectories import Trajectory, write_tum
 from terrainloop.simulation.missions import SimulatedMission, simulate_mission, write_mission
-from terrainloop.simulation.rendering import colours_of, images_of
 from terrainloop.submap import Submap
 
 SUBMAPS, SUBMAPS_QUICK = 16, 8  # the paper's datasets have about 15
@@ -50,6 +53,7 @@ QUICK = (PAPER[0], PAPER[4])
 REAL_MIN_OVERLAP = 0.3
 REAL_SUBMAPS = 30  # of a real mission: every pair is scored by every method
 SESSIONS_FILE = "passes.csv"
+RECORD_FILE = "made_by.json"  # key of the code that simulated the mission
 FRAMES_FILE = "frames.npy"  # T_world_body at each image, (submaps, images, 4, 4)
 EVERY = 2  # frames from image to image: 1 m
 
@@ -61,6 +65,11 @@ class Drive:
     name: str
     path: Path
     min_overlap: float
+
+    @cached_property
+    def key(self) -> str:
+        """Fingerprint of every file in its folder."""
+        return fingerprint(self.path)
 
     @cached_property
     def mission(self) -> Mission:
@@ -141,7 +150,7 @@ def _colours(file: Path) -> np.ndarray | None:
 
 
 def simulated(stand_in: StandIn, folder: Path, submaps: int) -> Drive:
-    """The stand-in as a mission folder, simulated unless it is there already."""
+    """The stand-in as a mission folder, simulated unless this code has done so already."""
     path = folder / stand_in.name
     asked = {
         "world": stand_in.world,
@@ -151,7 +160,7 @@ def simulated(stand_in: StandIn, folder: Path, submaps: int) -> Drive:
     }
     if path.exists():
         _check_same(path, asked)
-    else:
+    if not is_current(path / RECORD_FILE, code_key()):
         print(f"simulating {stand_in.name}: {stand_in.world}, seed {stand_in.seed}, {stand_in.sensor}")
         aside = folder / f".{stand_in.name}"
         shutil.rmtree(aside, ignore_errors=True)
@@ -159,6 +168,8 @@ def simulated(stand_in: StandIn, folder: Path, submaps: int) -> Drive:
         mission = simulate_mission(**asked)
         write_mission(mission, aside)
         _write_appearance(mission, aside)
+        (aside / RECORD_FILE).write_text(json.dumps({"key": code_key()}))
+        shutil.rmtree(path, ignore_errors=True)
         aside.rename(path)
     return Drive(stand_in.name, path, stand_in.min_overlap)
 
@@ -191,11 +202,8 @@ def real(path: Path, folder: Path) -> Drive:
         return drive
     print(f"{drive.name}: of {len(drive.mission)} submaps the {REAL_SUBMAPS} nearest the middle")
     part = folder / path.name
-    if not part.exists():
-        aside = folder / f".{path.name}"
-        shutil.rmtree(aside, ignore_errors=True)
-        _write_part(drive, aside)
-        aside.rename(part)
+    shutil.rmtree(part, ignore_errors=True)  # links and two tables: made anew each time, never out of date
+    _write_part(drive, part)
     return Drive(path.name, part, REAL_MIN_OVERLAP)
 
 

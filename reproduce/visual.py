@@ -1,5 +1,6 @@
 """Visual loop closures, image by image (paper, Fig. 7): the images of the same drives, in a bag of words."""
 
+import json
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from csv import DictReader
@@ -8,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.provenance import fingerprint
+from reproduce.baselines.ibow import closures, features_of
+from reproduce.kept import code_key, is_current
 from reproduce.missions import FRAMES_FILE, Drive
-from terrainloop.evaluation.baselines.ibow import closures, features_of
 from terrainloop.geometry import yaw_of
 from terrainloop.io.results import write_whole
 
@@ -42,9 +45,12 @@ class Frames:
 
     @classmethod
     def of(cls, drive: Drive, file: Path, skipped: int = SKIPPED) -> "Frames":
-        """Read what is in the file; made first, if it is not there."""
-        if not file.exists():
+        """Read the loops of a drive from a file; found first if the file is missing or out of date."""
+        key = fingerprint(code=code_key(), mission=drive.key, skipped=skipped)
+        record = file.with_suffix(".json")
+        if not (file.exists() and is_current(record, key)):
             _write(drive, file, skipped)
+            write_whole(record, lambda output: json.dump({"key": key}, output))
         with file.open(newline="", encoding="utf-8") as lines:
             rows = list(DictReader(lines))
         closed, inliers = (np.array([int(row[key]) for row in rows]) for key in ("closed", "inliers"))

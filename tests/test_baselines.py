@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from terrainloop.config import Settings
-from terrainloop.errors import TerrainLoopError
-from terrainloop.evaluation.baselines import (
+from reproduce.baselines import (
     fpfh,
     kiss,
     map_closures,
@@ -14,7 +12,9 @@ from terrainloop.evaluation.baselines import (
     random_score,
     scan_context,
 )
-from terrainloop.evaluation.baselines.method import NOT_COMPARABLE, Observation, Scale, require
+from reproduce.baselines.method import NOT_COMPARABLE, Observation, Scale, require
+from terrainloop.config import Settings
+from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import inverse, se3, transform, yaw_of
 from terrainloop.matching.register import compare
 from terrainloop.submap import Submap

@@ -4,16 +4,13 @@ import csv
 import json
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parent.parent
-
 METHODS = """
 import numpy as np
-from terrainloop.evaluation.baselines.method import Match, Method, require
+from reproduce.baselines.method import Match, Method, require
 
 def made(name, describe, score, **settings):
     return Method(name, settings, "made up 1.0", describe, score)
@@ -51,13 +48,12 @@ def methods(scale):
 
 @pytest.fixture(scope="module", autouse=True)
 def modules(tmp_path_factory):
-    """`reproduce`, which is not installed, and the methods of this test can be imported."""
+    """The methods of this test can be imported."""
     folder = tmp_path_factory.mktemp("methods")
     for name, code in (("good", GOOD), ("crashing", CRASHING), ("absent", ABSENT)):
         (folder / f"made_{name}.py").write_text(code)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(folder))
-        patch.syspath_prepend(str(ROOT))
         yield
 
 

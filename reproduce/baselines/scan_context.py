@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from terrainloop.evaluation.baselines.method import Match, Method, Observation, Scale
+from reproduce.baselines.method import Match, Method, Observation, Scale
 from terrainloop.geometry import Array, se3, transform
 
 RINGS, SECTORS = 20, 60  # as published

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from terrainloop.evaluation.baselines.method import Match, Method, Observation, Scale, require
+from reproduce.baselines.method import Match, Method, Observation, Scale, require
 from terrainloop.geometry import Array, inverse
 
 # Pixels along a submap's side: the published 0.5 m has about 400 along a local map of 100 m range. The share

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from terrainloop.evaluation.baselines.method import NOT_COMPARABLE, Match, Method, Observation, Scale
+from reproduce.baselines.method import NOT_COMPARABLE, Match, Method, Observation, Scale
 from terrainloop.geometry import Array
 
 Gray = NDArray[np.uint8]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrainloop.evaluation.baselines.method import Match, Method, Observation, Scale, require
+from reproduce.baselines.method import Match, Method, Observation, Scale, require
 from terrainloop.geometry import Array
 
 # Voxel as a share of the submap's side; radii of normals and of FPFH in voxels. 3 and 5 are the shipped

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from terrainloop.evaluation.baselines.method import Match, Method, Observation, Scale, require
+from reproduce.baselines.method import Match, Method, Observation, Scale, require
 from terrainloop.geometry import transform
 
 # Voxel as a share of the submap's side; radii of normals and of FPFH in voxels. 2 and 5 are the tutorial's;

@@ -1,4 +1,4 @@
-"""What the left camera of the rover photographs, and the colours of the points of its clouds."""
+"""Images of the rover's left camera, and colours for the points of its clouds."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -8,13 +8,11 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from terrainloop.geometry import transform
-from terrainloop.simulation.appearance import Ground, Light, Sun, ground_of, light, stream
+from reproduce.appearance.ground import Ground, Light, Sun, ground_of, light, stream
+from terrainloop.geometry import Array, transform
 from terrainloop.simulation.missions import SETUPS, SimulatedMission
 from terrainloop.simulation.sensors import StereoCamera, cast_rays
 from terrainloop.simulation.terrain import Terrain
-
-Array = NDArray[np.float64]
 
 STEP = 4  # pixels between the rays that are cast first
 BEND = 0.02  # second difference of the inverse depth from ray to ray above which each pixel is cast
@@ -26,14 +24,14 @@ NOISE = 1.5  # standard deviation of a pixel at mid-grey, of 255; half of it is 
 
 @dataclass(frozen=True)
 class Sky:
-    """How the sun stands during a drive.
+    """The sun during a drive.
 
     Attributes
     ----------
     elevation_deg : float
-        Of the sun, the whole time.
+        Elevation of the sun, constant.
     turn_deg : float
-        How far its azimuth turns from one submap to the next.
+        Change of its azimuth from one submap to the next.
     """
 
     elevation_deg: float = 35.0

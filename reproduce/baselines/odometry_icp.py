@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from terrainloop.evaluation.baselines.method import (
+from reproduce.baselines.method import (
     NOT_COMPARABLE,
     Match,
     Method,

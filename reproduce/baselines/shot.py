@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from reproduce.baselines.method import NOT_COMPARABLE, Match, Method, Observation, Scale
 from terrainloop.errors import TerrainLoopError
-from terrainloop.evaluation.baselines.method import NOT_COMPARABLE, Match, Method, Observation, Scale
 from terrainloop.geometry import Array
 
 SUPPORT_RADII = (0.075, 0.1)  # tried, in sides of a submap

@@ -4,7 +4,7 @@ import zlib
 
 import numpy as np
 
-from terrainloop.evaluation.baselines.method import Match, Method, Observation, Scale
+from reproduce.baselines.method import Match, Method, Observation, Scale
 
 
 def methods(scale: Scale) -> tuple[Method, ...]:

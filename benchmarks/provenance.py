@@ -1,0 +1,56 @@
+"""Where a result comes from: a fingerprint of code, data and settings, and the machine.
+
+Used by the benchmarks beside it and by ``reproduce``. Whatever is kept from one run to the next is kept
+under its fingerprint, so that a result of other code, data or settings is never taken for the present one.
+"""
+
+import json
+import platform
+from hashlib import sha256
+from pathlib import Path
+
+import terrainloop._core
+
+
+def package() -> tuple[Path, ...]:
+    """Folders of the terrainloop that is imported, and its compiled core wherever that was built."""
+    return (*map(Path, terrainloop.__path__), Path(terrainloop._core._core.__file__))
+
+
+def fingerprint(*roots: Path, **conditions: object) -> str:
+    """Hash of the content of files and of anything else that a result depends on.
+
+    Parameters
+    ----------
+    *roots : Path
+        Files, or folders with all files below them except Python's caches. Names count relative to the
+        root, times of modification do not count.
+    **conditions : JSON-serialisable
+        Settings, seeds, versions.
+
+    Returns
+    -------
+    str
+        64 hexadecimal digits.
+    """
+    whole = sha256(json.dumps(conditions, sort_keys=True).encode())
+    for root in roots:
+        for file in sorted(_files(root)):
+            name = file.relative_to(root.parent if root.is_file() else root).as_posix()
+            content = sha256(file.read_bytes()).hexdigest()
+            whole.update(f"{name}\0{content}\n".encode())
+    return whole.hexdigest()
+
+
+def _files(root: Path) -> list[Path]:
+    if root.is_file():
+        return [root]
+    return [file for file in root.rglob("*") if file.is_file() and "__pycache__" not in file.parts]
+
+
+def processor() -> str:
+    """Model name of the CPU."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
