@@ -1,11 +1,14 @@
 """Every figure makes a picture, also of what went wrong, without a warning and the same each time."""
 
+import sys
 from dataclasses import replace
+from importlib import import_module
 
 import cv2
 import numpy as np
 import pytest
 
+from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.precision_recall import OperatingPoint
 from terrainloop.geometry import se2, se3
 from terrainloop.loop import LoopCandidate
@@ -213,3 +216,14 @@ def test_curves_of_precision_and_recall_are_drawn_in_steps(tmp_path):
     assert np.diff(recall) @ precision[1:] == pytest.approx((1 + 2 / 5) / 2)
     assert len(empty.get_xdata()) == 0
     assert (dots.get_xdata(), dots.get_ydata()) == ([0.5], [1.0])
+
+
+def test_without_matplotlib_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    for name in [
+        *filter(lambda name: name.startswith("matplotlib."), sys.modules),
+        "terrainloop.report.figures",
+    ]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(TerrainLoopError, match=r"expected matplotlib.*terrainloop\[figures\]"):
+        import_module("terrainloop.report.figures")

@@ -114,13 +114,14 @@ def require(module: str, package: str) -> tuple[ModuleType, str]:
     Raises
     ------
     TerrainLoopError
-        If it is not installed, in one line that says how to.
+        If it is not installed or cannot be imported, in one line.
     """
     try:
         return import_module(module), f"{package} {version(package)}"
     except ImportError as error:
+        absent = isinstance(error, ModuleNotFoundError)
         raise TerrainLoopError(
             expected=f"the package {package}, which this baseline runs",
-            found=str(error),
-            mend=f"pip install {package}",
+            found=" ".join(str(error).split()),
+            mend=f"pip install {package}" if absent else "install the system library that it names",
         ) from error

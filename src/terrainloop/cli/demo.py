@@ -32,6 +32,7 @@ def command(
     from terrainloop.config import Settings
     from terrainloop.evaluation.judge import judge
     from terrainloop.io.missions import load_mission
+    from terrainloop.report import INSTALL_FIGURES, can_draw
     from terrainloop.simulation.missions import simulate_mission, write_mission
 
     terminal = Terminal.open(as_json, quiet, verbose)
@@ -45,7 +46,7 @@ def command(
     mission, settings = load_mission(folder), Settings()
     detector, records = detect.run_detection(mission, settings, output, workers, terminal)
     pairs = judge(detector.candidates, records, simulated.truth)
-    pictures = _draw(output, mission, detector, records)
+    pictures = _draw(output, mission, detector, records) if can_draw() else []
     summary = detect.summarise(detector.candidates, records) | {
         "false_loops": sum(not pair.pose_is_right for pair in pairs if pair.candidate),
         "true_pairs": sum(pair.overlap > 0.3 for pair in pairs),
@@ -60,7 +61,8 @@ def command(
             f"Against the truth: {summary['true_pairs_found']} of {summary['true_pairs']} pairs that share "
             f"over 30 % of their ground found, {summary['false_loops']} false loops."
         )
-        console.print("Pictures: " + ", ".join(summary["pictures"]))
+        drawn = ", ".join(summary["pictures"]) or f"none; matplotlib is missing: {INSTALL_FIGURES}"
+        console.print(f"Pictures: {drawn}", markup=False)
 
     terminal.result(summary, show)
 

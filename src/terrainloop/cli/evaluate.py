@@ -64,6 +64,7 @@ def command(
     from terrainloop.io.missions import read_sessions
     from terrainloop.io.results import read_loops, read_submaps
     from terrainloop.io.trajectories import read_trajectory
+    from terrainloop.report import can_draw
 
     terminal = Terminal.open(as_json, quiet, verbose)
     candidates, records = read_loops(run / "pairs.csv"), read_submaps(run / "submaps.csv")
@@ -89,7 +90,8 @@ def command(
         run / "precision_recall_curve.csv", ["truth", "right_by", f"min_{name}", *_COUNTS], _curve_rows(read)
     )
     metrics = {key: reading.metrics() for key, reading in read.items()}
-    _draw(run / "precision_recall.png", points, read, metrics, f"true match: IoU > {min_overlap:g}", name)
+    if can_draw():
+        _draw(run / "precision_recall.png", points, read, metrics, f"true match: IoU > {min_overlap:g}", name)
     summary = summarise(pairs, min_overlap) | {
         "threshold": name,
         "metrics": [

@@ -6,9 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import ConnectionPatch
 from numpy.typing import NDArray
 
 from terrainloop.errors import TerrainLoopError
@@ -18,7 +15,17 @@ from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.correspondences import Associations
 from terrainloop.matching.ssd import shared_ground, warp
+from terrainloop.report import INSTALL_FIGURES
 from terrainloop.submap import Submap
+
+try:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.patches import ConnectionPatch
+except ImportError as error:
+    raise TerrainLoopError(
+        expected="matplotlib, which draws the pictures", found=str(error), mend=INSTALL_FIGURES
+    ) from error
 
 SOURCE_COLOUR, TARGET_COLOUR = "#d1495b", "#00798c"
 DRAWN_POINTS = 40_000  # more do not show at this size
