@@ -11,7 +11,6 @@ from reproduce.appearance.noise import value_noise
 from reproduce.appearance.rendering import (
     GREY,
     Sky,
-    _directions,
     _inverse_depth,
     colours_of,
     images_of,
@@ -51,7 +50,7 @@ def _detail(image):
 
 def _depth(T_world_camera):
     v, u = np.arange(CAMERA.height), np.arange(CAMERA.width)
-    directions = _directions(CAMERA, v, u) @ T_world_camera[:3, :3].T
+    directions = CAMERA.directions(v, u) @ T_world_camera[:3, :3].T
     return directions, _inverse_depth(_ground(), T_world_camera[:3, 3], CAMERA, T_world_camera, directions)
 
 
