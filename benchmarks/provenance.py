@@ -1,7 +1,7 @@
-"""Where a result comes from: a fingerprint of code, data and settings, and the machine.
+"""Provenance of results: a fingerprint of code, data and settings, and the machine.
 
-Used by the benchmarks beside it and by ``reproduce``. Whatever is kept from one run to the next is kept
-under its fingerprint, so that a result of other code, data or settings is never taken for the present one.
+Used by the benchmarks in this folder and by ``reproduce``. Results stored for later runs are keyed on their
+fingerprint, so that a result of other code, data or settings is never reused.
 """
 
 import json
@@ -13,7 +13,7 @@ import terrainloop._core
 
 
 def package() -> tuple[Path, ...]:
-    """Folders of the terrainloop that is imported, and its compiled core wherever that was built."""
+    """Folders of the imported terrainloop, and its compiled core, which may have been built elsewhere."""
     return (*map(Path, terrainloop.__path__), Path(terrainloop._core._core.__file__))
 
 
@@ -23,8 +23,8 @@ def fingerprint(*roots: Path, **conditions: object) -> str:
     Parameters
     ----------
     *roots : Path
-        Files, or folders with all files below them except Python's caches. Names count relative to the
-        root, times of modification do not count.
+        Files, or folders with all files below them except Python's caches. Names relative to the root are
+        included, times of modification are not.
     **conditions : JSON-serialisable
         Settings, seeds, versions.
 

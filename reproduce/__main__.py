@@ -2,8 +2,8 @@
 
 Regenerates the paper's figures and tables, with today's peers and with two missions beyond it (Mars and
 EtnaLidar, simulated, too): ``python -m reproduce`` from the root of the repository. Real missions are given
-with --mission. Every OUT/NAME.png has its numbers in OUT/NAME.csv. Run it again to resume: what is done is
-kept as long as code, missions and settings stay the same.
+with --mission. Every OUT/NAME.png has its numbers in OUT/NAME.csv. Run it again to resume: results
+are reused as long as code, missions and settings stay the same.
 """
 
 import argparse

@@ -1,6 +1,6 @@
-"""What a run keeps is kept only as long as the code, the data and the settings that it came from.
+"""Stored results are reused only if the code, the data and the settings behind them are still the same.
 
-Everything kept has a record beside it, a JSON file with a fingerprint under "key".
+Each has a record beside it: a JSON file with a fingerprint under "key".
 """
 
 import json
@@ -18,12 +18,12 @@ from terrainloop import __version__
 
 @cache
 def code_key() -> str:
-    """Fingerprint of terrainloop with its compiled core, of this package, and of what they run on."""
+    """Fingerprint of terrainloop with its compiled core, of this package, and of their dependencies."""
     return fingerprint(*package(), Path(__file__).parent, versions=versions())
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that all methods share."""
+    """Versions of the software that all methods share."""
     return {
         "terrainloop": __version__,
         "python": platform.python_version(),
@@ -34,7 +34,7 @@ def versions() -> dict[str, str]:
 
 
 def is_current(record: Path, key: str) -> bool:
-    """Whether a record is there and has this key."""
+    """Whether a record exists and has this key."""
     try:
         return json.loads(record.read_text(encoding="utf-8"))["key"] == key
     except (OSError, ValueError, KeyError, TypeError):

@@ -1,4 +1,4 @@
-"""The missions: simulated stand-ins for the paper's, others beyond it, and real ones where given."""
+"""The missions: simulated stand-ins for the paper's, further simulated ones, and real ones if given."""
 
 import json
 import shutil
@@ -60,7 +60,7 @@ EVERY = 2  # frames from image to image: 1 m
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A mission on disk, and what makes a true match on it."""
+    """A mission on disk, and the overlap of a true match."""
 
     name: str
     path: Path
@@ -77,7 +77,7 @@ class Drive:
 
     @cached_property
     def sessions(self) -> dict[str, str] | None:
-        """Session of each submap by name, where a file beside the clouds tells."""
+        """Session of each submap by name, if a file beside the clouds lists them."""
         file = self.path / SESSIONS_FILE
         return read_sessions(file) if file.exists() else None
 
@@ -88,7 +88,7 @@ class Drive:
             raise TerrainLoopError(
                 expected=f"truth.tum in {self.path}",
                 found="none",
-                mend="give the true pose of each submap, one line a cloud",
+                mend="give the true pose of each submap, one line per cloud",
             )
         return self.mission.truth.poses
 
@@ -111,7 +111,7 @@ class Drive:
         return observed_iou(clouds, self.poses, ground_cell(clouds))
 
     def observations(self) -> Iterator[Observation]:
-        """All that a method may know of each submap, in the order driven."""
+        """The data of each submap that a method has access to, in chronological order."""
         odometry = self.mission.odometry
         for i, (name, submap) in enumerate(zip(self.mission.names, self.submaps, strict=True)):
             yield Observation(
@@ -123,16 +123,16 @@ class Drive:
 
     @property
     def filmed(self) -> bool:
-        """Whether a camera went along whose poses are known."""
+        """Whether there are camera images with known poses."""
         return (self.path / FRAMES_FILE).exists() and any((self.path / "images").iterdir())
 
     def images(self, name: str) -> list[np.ndarray]:
-        """Camera images of a submap, grey, in the order driven."""
+        """Grey camera images of a submap in chronological order."""
         files = sorted((self.path / "images").glob(f"{name}_*.png"))
         return [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]
 
     def pairs(self) -> list[tuple[int, int]]:
-        """Every (source, target) that is judged: source later, not consecutive, of another session."""
+        """Every (source, target) that is evaluated: source later, not consecutive, of another session."""
         return pairs_of(self.mission.names, self.sessions)
 
 
@@ -150,7 +150,7 @@ def _colours(file: Path) -> np.ndarray | None:
 
 
 def simulated(stand_in: StandIn, folder: Path, submaps: int) -> Drive:
-    """The stand-in as a mission folder, simulated unless this code has done so already."""
+    """The stand-in as a mission folder; simulated unless already there from the same code."""
     path = folder / stand_in.name
     asked = {
         "world": stand_in.world,
@@ -175,7 +175,7 @@ def simulated(stand_in: StandIn, folder: Path, submaps: int) -> Drive:
 
 
 def _write_appearance(mission: SimulatedMission, folder: Path) -> None:
-    """What the camera saw: images, true pose of the rover at each, and the colours of the points."""
+    """Camera images, the true pose of the rover at each, and the colours of the points."""
     for name in ("images", "colours"):
         (folder / name).mkdir(exist_ok=True)
     for i, (images, colours) in enumerate(zip(images_of(mission, EVERY), colours_of(mission), strict=True)):
@@ -196,13 +196,13 @@ def _check_same(path: Path, asked: Mapping[str, object]) -> None:
 
 
 def real(path: Path, folder: Path) -> Drive:
-    """A mission of others; of a large one, the submaps nearest its middle, linked to from the folder."""
+    """A real mission; of a large one, the submaps nearest its middle, as links in the folder."""
     drive = Drive(path.name, path, REAL_MIN_OVERLAP)
     if len(drive.poses) <= REAL_SUBMAPS:
         return drive
     print(f"{drive.name}: of {len(drive.mission)} submaps the {REAL_SUBMAPS} nearest the middle")
     part = folder / path.name
-    shutil.rmtree(part, ignore_errors=True)  # links and two tables: made anew each time, never out of date
+    shutil.rmtree(part, ignore_errors=True)  # links and two tables, cheap enough to be rewritten every time
     _write_part(drive, part)
     return Drive(path.name, part, REAL_MIN_OVERLAP)
 

@@ -1,8 +1,8 @@
 """Runs every method on every mission, each in a process of its own with one thread; resumes.
 
 A task leaves OUT/MISSION/METHOD-K.csv (source, target, score, transform) and a JSON record beside it with
-settings, software and times; K numbers the choices of settings. What is there is not done again unless the
-code, the mission, the settings or the machine are others than its record names.
+settings, software and times; K numbers the choices of settings. A task is skipped if its results exist and
+their record has the key of the present code, mission, settings and processor.
 """
 
 import csv
@@ -93,7 +93,7 @@ class Task:
 
     @property
     def done(self) -> bool:
-        """Whether its results are there, and are those of its key."""
+        """Whether its results exist, under its key."""
         return self.csv.exists() and is_current(self.json, self.key)
 
 

@@ -1,4 +1,4 @@
-"""The random classifier: what a score that knows nothing reaches (paper, Fig. 8)."""
+"""The random classifier (paper, Fig. 8)."""
 
 import zlib
 
