@@ -5,7 +5,9 @@ fingerprint, so that a result of other code, data or settings is never reused.
 """
 
 import json
+import os
 import platform
+from collections.abc import Iterator
 from hashlib import sha256
 from pathlib import Path
 
@@ -42,10 +44,13 @@ def fingerprint(*roots: Path, **conditions: object) -> str:
     return whole.hexdigest()
 
 
-def _files(root: Path) -> list[Path]:
+def _files(root: Path) -> Iterator[Path]:
+    """A file itself, or all files below a folder; linked folders are followed, as readers follow them."""
     if root.is_file():
-        return [root]
-    return [file for file in root.rglob("*") if file.is_file() and "__pycache__" not in file.parts]
+        yield root
+    for folder, below, names in os.walk(root, followlinks=True):
+        below[:] = [name for name in below if name != "__pycache__"]
+        yield from (path for path in (Path(folder, name) for name in names) if path.is_file())
 
 
 def processor() -> str:

@@ -70,6 +70,20 @@ def test_where_the_files_are_does_not_count(folder, tmp_path):
     assert fingerprint(folder / "one.py") == fingerprint(moved / "one.py")
 
 
+def test_what_is_behind_a_link_counts(folder, tmp_path):
+    """A mission may link to its folder of clouds, or to each of them."""
+    mission = tmp_path / "mission"
+    mission.mkdir()
+    (mission / "clouds").symlink_to(folder)
+    (mission / "truth.tum").symlink_to(folder / "one.py")
+    before = fingerprint(mission)
+    rewrite(folder / "below" / "core.so")
+    after = fingerprint(mission)
+    assert after != before
+    rewrite(folder / "one.py")
+    assert fingerprint(mission) != after
+
+
 def test_settings_count_whatever_their_order():
     before = fingerprint(settings={"a": 1, "b": [0.5, None]}, seed=1)
     assert fingerprint(seed=1, settings={"b": [0.5, None], "a": 1}) == before
