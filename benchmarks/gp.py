@@ -19,6 +19,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+from provenance import processor
 from scenes import stereo_submap
 
 LENGTH_SCALE, VARIANCE, NOISE = 0.316, 0.01, 0.02
@@ -323,12 +324,10 @@ def markdown(results):
 def machine(threads):
     from threadpoolctl import threadpool_info
 
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
     blas = {f"{i['internal_api']} {i['version']} ({i.get('architecture')})" for i in threadpool_info()}
     core = os.environ.get("OPENBLAS_CORETYPE")
     return {
-        "cpu": names[0] if names else platform.processor(),
+        "cpu": processor(),
         "threads": threads,
         "blas": ", ".join(sorted(blas)) + (f", OPENBLAS_CORETYPE={core}" if core else ""),
         "python": platform.python_version(),

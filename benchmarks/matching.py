@@ -12,7 +12,6 @@ With --figure F.png, null and errors also draw what was expected against what wa
 """
 
 import argparse
-import hashlib
 import pickle
 import platform
 import time
@@ -29,10 +28,11 @@ import cv2
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.random import SeedSequence
+from provenance import fingerprint, package
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
-from terrainloop import Settings, Submap, __version__
+from terrainloop import Settings, Submap
 from terrainloop.detection.detector import fit_database, map_submap
 from terrainloop.detection.mission import _fit_mission
 from terrainloop.evaluation.overlap import world_boxes
@@ -73,10 +73,7 @@ METHODS = {
 def mapped(folder):
     """Mapped submaps, their records and true poses, and sessions of a mission."""
     mission = load_mission(folder)
-    files = sorted(p for p in folder.rglob("*") if p.is_file())
-    key = hashlib.sha256(
-        repr([(str(f), f.stat().st_mtime_ns, __version__) for f in files]).encode()
-    ).hexdigest()
+    key = fingerprint(*package(), Path(__file__), folder, settings=EVIDENCE.model_dump())
     cache = CACHE / f"{key[:16]}.pickle"
     if not cache.exists():
         parameters = _fit_mission(mission, EVIDENCE, 2)

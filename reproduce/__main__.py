@@ -2,8 +2,8 @@
 
 Regenerates the paper's figures and tables, with today's peers and with two missions beyond it (Mars and
 EtnaLidar, simulated, too): ``python -m reproduce`` from the root of the repository. Real missions are given
-with --mission. Every OUT/NAME.png has its numbers in OUT/NAME.csv. What is done is kept: run it again to
-resume.
+with --mission. Every OUT/NAME.png has its numbers in OUT/NAME.csv. Run it again to resume: results
+are reused as long as code, missions and settings stay the same.
 """
 
 import argparse
@@ -15,19 +15,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from reproduce import figures, ours, table
-from reproduce.missions import (
-    BEYOND,
-    PAPER,
-    QUICK,
-    SUBMAPS,
-    SUBMAPS_QUICK,
-    Drive,
-    real,
-    simulated,
-)
+from benchmarks.provenance import processor
+from reproduce import figures, table
+from reproduce.baselines import ours
+from reproduce.kept import versions
+from reproduce.missions import BEYOND, PAPER, QUICK, SUBMAPS, SUBMAPS_QUICK, Drive, real, simulated
 from reproduce.results import Result, best_of_each
-from reproduce.runner import ROOT, run_all, tasks_of, versions
+from reproduce.runner import ROOT, run_all, tasks_of
 from reproduce.visual import frames_of
 from terrainloop.errors import TerrainLoopError
 from terrainloop.io.results import write_whole
@@ -46,7 +40,7 @@ TIMES = (
 )
 NONE = "'-': no pair could be compared: there are no images, colours or odometry, or too little was found."
 REAL = ROOT.parent / "shared/data/missions/pozo_r20"  # taken where it is there
-BASELINES = "terrainloop.evaluation.baselines."
+BASELINES = "reproduce.baselines."
 PAPERS = ("default", "paper", "shot", "random_score")
 PEERS = ("default", "fpfh", "kiss", "map_closures", "scan_context", "odometry_icp", "ibow", "random_score")
 NEEDED = {  # modules with the methods that each figure or table shows
@@ -138,13 +132,6 @@ def record_run(args: argparse.Namespace, out: Path, drives: Sequence[Drive]) -> 
 
 def machine() -> dict[str, str | int | None]:
     return {"system": platform.platform(), "processor": processor(), "cores": os.cpu_count()}
-
-
-def processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.exists() else []
-    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return named[0] if named else platform.processor()
 
 
 def write_figures(

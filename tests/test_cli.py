@@ -553,6 +553,13 @@ def test_demo_runs(ok, tmp_path, fast_default):
     assert rows_of(output / "submaps.csv")
 
 
+def test_without_matplotlib_the_demo_runs_and_names_the_extra(ok, tmp_path, fast_default, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    told = ok("demo", "-o", tmp_path, "--submaps", 3, "--workers", 1, "--world", "flat")
+    assert 'Pictures: none; matplotlib is missing: pip install "terrainloop[figures]"' in in_one_line(told)
+    assert not list(tmp_path.glob("*.png"))
+
+
 # --- what cannot be worked with
 
 

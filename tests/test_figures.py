@@ -1,6 +1,8 @@
 """Every figure makes a picture, also of what went wrong, without a warning and the same each time."""
 
+import sys
 from dataclasses import replace
+from importlib import import_module
 
 import cv2
 import numpy as np
@@ -9,6 +11,7 @@ from conftest import STRICT
 from evaluation_util import right, write_run, wrong
 
 from terrainloop.entry import MapEntry
+from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.summary import evaluate_run
 from terrainloop.features import extract_features
 from terrainloop.geometry import se2, se3
@@ -207,3 +210,14 @@ def test_curves_of_precision_and_recall_are_drawn_in_steps(tmp_path):
     assert (accepted.get_xdata(), accepted.get_ydata()) == ([0.0], [0.0])
     drawn = by_threshold.get_lines()[0].get_ydata()
     np.testing.assert_array_equal(drawn, [row["pose_precision"] for row in evaluation.table])
+
+
+def test_without_matplotlib_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    for name in [
+        *filter(lambda name: name.startswith("matplotlib."), sys.modules),
+        "terrainloop.report.figures",
+    ]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(TerrainLoopError, match=r"expected matplotlib.*terrainloop\[figures\]"):
+        import_module("terrainloop.report.figures")

@@ -42,6 +42,7 @@ def command(
     from terrainloop.evaluation.pairs import evaluate_pairs
     from terrainloop.evaluation.truth import MIN_OVERLAP, GroundTruth
     from terrainloop.io.missions import load_mission
+    from terrainloop.report import INSTALL_FIGURES, can_draw
     from terrainloop.simulation.missions import simulate_mission, write_mission
 
     terminal = Terminal.open(as_json, quiet, verbose)
@@ -60,7 +61,8 @@ def command(
         )
     candidates = list(run.pairs())
     pairs = evaluate_pairs(candidates, GroundTruth(run.submaps, simulated.truth))
-    pictures = _draw(output, mission, run, max(candidates, key=lambda candidate: candidate.score))
+    best = max(candidates, key=lambda candidate: candidate.score)
+    pictures = _draw(output, mission, run, best) if can_draw() else []
     summary = detect.summarise(run) | {
         "false_loops": sum(not pair.pose_is_right for pair in pairs if pair.candidate),
         "true_pairs": sum(pair.overlap > MIN_OVERLAP for pair in pairs),
@@ -74,7 +76,8 @@ def command(
             f"Against the ground truth: {summary['true_pairs_found']} of {summary['true_pairs']} pairs that "
             f"share over {MIN_OVERLAP:.0%} of their ground found, {summary['false_loops']} false loops."
         )
-        console.print("Pictures: " + ", ".join(summary["pictures"]), markup=False)
+        drawn = ", ".join(summary["pictures"]) or f"none; matplotlib is missing: {INSTALL_FIGURES}"
+        console.print(f"Pictures: {drawn}", markup=False)
 
     terminal.result(summary, show)
 

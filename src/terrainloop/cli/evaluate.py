@@ -59,7 +59,7 @@ def command(
     detect with --all-pairs to score every other pair.
     """
     from terrainloop.evaluation.summary import evaluate_run
-    from terrainloop.report.figures import figure_precision_recall, save_figure
+    from terrainloop.report import can_draw
 
     terminal = Terminal.open(as_json, quiet, verbose)
     evaluation = evaluate_run(
@@ -72,7 +72,10 @@ def command(
         clouds=clouds,
     )
     evaluation.write(run)
-    save_figure(figure_precision_recall(evaluation), run / "precision_recall.png")
+    if can_draw():
+        from terrainloop.report.figures import figure_precision_recall, save_figure
+
+        save_figure(figure_precision_recall(evaluation), run / "precision_recall.png")
     terminal.result(evaluation.as_dict(), lambda console: show(console, evaluation))
 
 

@@ -1,5 +1,6 @@
 """``terrainloop match``: two clouds, loop or not."""
 
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -49,6 +50,7 @@ def command(
     settings = read_settings(preset, config, seed, max_false_loops)
     if figure is not None:
         check_output(figure, (".png",))
+        import_module("terrainloop.report.figures")
     submaps = read_cloud(source), read_cloud(target)
     with terminal.progress() as progress:
         progress("match", 0, 2)

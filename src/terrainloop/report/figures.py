@@ -5,9 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import ConnectionPatch
 from numpy.typing import NDArray
 
 from terrainloop.config import Settings
@@ -20,7 +17,17 @@ from terrainloop.loop import LoopCandidate
 from terrainloop.matching.correspondences import Associations, associate
 from terrainloop.matching.overlay import Overlay
 from terrainloop.matching.ransac import get_inliers, inlier_radius_of
+from terrainloop.report import INSTALL_FIGURES
 from terrainloop.submap import Submap
+
+try:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.patches import ConnectionPatch
+except ImportError as error:
+    raise TerrainLoopError(
+        expected="matplotlib, which draws the pictures", found=str(error), mend=INSTALL_FIGURES
+    ) from error
 
 SOURCE_COLOUR, TARGET_COLOUR = "#d1495b", "#00798c"
 DRAWN_POINTS = 40_000  # more do not show at this size

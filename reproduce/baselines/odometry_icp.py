@@ -1,15 +1,15 @@
-"""The naive one: two submaps laid upon each other by odometry, settled by ICP, scored by what then meets.
+"""Naive baseline: initialise with odometry, refine with ICP, score by the inlier fraction.
 
 ICP is small_gicp's default, generalized ICP (K. Koide, JOSS 2024; A. Segal et al., RSS 2009): point-to-plane
-slides on smooth ground, and was right for 0.6 of the true pairs where this was for all. Mind that no other
-method is told the odometry.
+slides on smooth ground and registered 0.6 of the true pairs, generalized ICP all of them. This is the only
+method that uses odometry.
 """
 
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from terrainloop.evaluation.baselines.method import (
+from reproduce.baselines.method import (
     NOT_COMPARABLE,
     Match,
     Method,
@@ -20,13 +20,13 @@ from terrainloop.evaluation.baselines.method import (
 from terrainloop.geometry import Array, inverse
 
 VOXEL = 1 / 100  # of the submap's side
-ITERATIONS = 100  # at most
-REACHES = (2.0, 4.0)  # largest distance of two points that meet, in voxels
+ITERATIONS = 100  # maximum
+REACHES = (2.0, 4.0)  # maximum correspondence distance, in voxels
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A thinned small_gicp cloud with covariances, its KD-tree, and its pose by odometry."""
+    """A downsampled small_gicp cloud with covariances, its KD-tree, and its pose by odometry."""
 
     cloud: Any
     tree: Any
@@ -55,7 +55,7 @@ def _describe(package: Any, observation: Observation, *, voxel: float) -> Prepar
 
 
 def _score(package: Any, source: Prepared, target: Prepared, *, reach: float) -> Match:
-    """The share of the source that meets the target once ICP is done."""
+    """Score by the share of source points that have a correspondence once ICP has converged."""
     if source.T_odometry_submap is None or target.T_odometry_submap is None:
         return Match(NOT_COMPARABLE)
     result = package.align(

@@ -1,6 +1,6 @@
 """SHOT + RANSAC and CSHOT + RANSAC, the paper's own baselines, by the Point Cloud Library itself.
 
-As the paper says (section VI-C): keypoints of high curvature, matched by their descriptors, outliers removed
+As in the paper (section VI-C): keypoints of high curvature, matched by their descriptors, outliers removed
 by PCL's RANSAC, which goes on until an outlier-free sample was drawn with probability 0.99. Descriptors:
 Tombari, Salti and Di Stefano, "Unique signatures of histograms for local surface description" (ECCV 2010),
 and with colours "A combined texture-shape descriptor for enhanced 3D feature matching" (ICIP 2011).
@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from reproduce.baselines.method import NOT_COMPARABLE, Match, Method, Observation, Scale
 from terrainloop.errors import TerrainLoopError
-from terrainloop.evaluation.baselines.method import NOT_COMPARABLE, Match, Method, Observation, Scale
 from terrainloop.geometry import Array
 
 SUPPORT_RADII = (0.075, 0.1)  # tried, in sides of a submap
@@ -29,7 +29,7 @@ SUPPORT_RADII = (0.075, 0.1)  # tried, in sides of a submap
 _SOURCES = tuple(Path(__file__).parent / "pcl" / name for name in ("CMakeLists.txt", "shot.cpp"))
 _INSTALL = "apt install libpcl-dev cmake g++"
 _DESCRIPTOR_SIZE = {"shot": 352, "cshot": 1344}
-_FEWEST_MATCHES = 3  # that fix a pose
+_FEWEST_MATCHES = 3  # that determine a pose
 
 
 @dataclass(frozen=True)
@@ -43,19 +43,19 @@ class Settings:
     leaf : float
         Side of the cubes within which points are averaged first.
     normal_radius : float
-        Neighbourhood of a point's normal and curvature.
+        Radius of the neighbourhood for normal and curvature of a point.
     support_radius : float
-        Neighbourhood that a descriptor describes.
+        Radius of the neighbourhood that a descriptor describes.
     separation : float
-        Least distance between keypoints.
+        Minimum distance between keypoints.
     share : float
-        Share of the points, those of highest curvature, that may be keypoints.
+        Share of the points, those of highest curvature, that are keypoint candidates.
     keypoints : int
-        Most keypoints of a submap.
+        Maximum number of keypoints per submap.
     inlier_radius : float
-        Of RANSAC.
+        Inlier threshold of RANSAC.
     iterations : int
-        Most iterations of RANSAC.
+        Maximum number of RANSAC iterations.
     """
 
     kind: str
@@ -71,7 +71,7 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """What is kept of a submap.
+    """Description of a submap.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ def methods(scale: Scale) -> tuple[Method, ...]:
 
 
 def built_program() -> Path:
-    """The program that runs PCL, compiled into the user's cache folder unless it is there already.
+    """The program that calls PCL, compiled into the user's cache folder unless it is there already.
 
     Raises
     ------

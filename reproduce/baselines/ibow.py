@@ -1,15 +1,15 @@
-"""Places told by how they look: an incremental bag of binary words over ORB features.
+"""Appearance-based place recognition: an incremental bag of binary words over ORB features.
 
 E. Garcia-Fidalgo and A. Ortiz, iBoW-LCD: An Appearance-Based Loop-Closure Detection Approach Using
-Incremental Bags of Binary Words, IEEE Robotics and Automation Letters 3(4), 2018. Written anew after the
-publication, whose full text was not at hand: rules of islands and scores were not checked against it line by
-line. The authors' own program is under the GPL and was not read; of it only the settings of its published
-runs were. What is known to differ:
+Incremental Bags of Binary Words, IEEE Robotics and Automation Letters 3(4), 2018. Reimplemented from the
+publication, whose full text was not available: the rules for islands and scores were not checked against it
+line by line. The authors' program is under the GPL and was not read, except for the settings of its published
+runs. Known differences:
 
 - a small vocabulary is searched exhaustively and a large one in FLANN's hash tables (LSH, its settings for
-  ORB), where theirs is searched in trees: all but the first are approximate;
-- words seen once are kept, as in those of their runs that do not purge;
-- every loop passes the epipolar check, also within a run of loops, since its inliers are the score.
+  ORB), theirs in trees: all but the exhaustive search are approximate;
+- words seen once are kept, as in their runs without purging;
+- every loop has to pass the epipolar check, also within a sequence of loops, since its inliers are the score.
 """
 
 from collections.abc import Sequence
@@ -20,15 +20,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from terrainloop.evaluation.baselines.method import NOT_COMPARABLE, Match, Method, Observation, Scale
+from reproduce.baselines.method import NOT_COMPARABLE, Match, Method, Observation, Scale
 from terrainloop.geometry import Array
 
 Gray = NDArray[np.uint8]
 
 FEATURES = 1500  # ORB features of an image, as the paper of the gradient maps has it
-RATIO = 0.8  # of the distances to the nearest and the second nearest; above it neither is meant
+RATIO = 0.8  # of the distances to the nearest and the second nearest; matches above it are ambiguous
 EPIPOLAR_PX, CONFIDENCE = 3.0, 0.99
-EXHAUSTIVE = 5000  # words up to which each is compared
+EXHAUSTIVE = 5000  # size of a vocabulary up to which it is searched exhaustively
 LSH: dict[str, bool | int | float | str] = {
     "algorithm": 6,
     "table_number": 6,
@@ -53,7 +53,7 @@ class Features:
 
 
 def features_of(image: Gray, fast_threshold: int = 20) -> Features:
-    """The strongest ORB features of a grey image, `FEATURES` at most; OpenCV's settings else."""
+    """The strongest ORB features of a grey image, at most `FEATURES`; other settings as in OpenCV."""
     orb = cv2.ORB_create(nfeatures=FEATURES, fastThreshold=fast_threshold)  # type: ignore[attr-defined]
     keypoints, descriptors = orb.detectAndCompute(image, None)
     if descriptors is None:
@@ -62,9 +62,9 @@ def features_of(image: Gray, fast_threshold: int = 20) -> Features:
 
 
 def epipolar_inliers(a: Features, b: Features) -> int:
-    """Matches of two images that one fundamental matrix explains; 0 where they are too few for one.
+    """Number of matches of two images consistent with one fundamental matrix; 0 if too few to estimate it.
 
-    OpenCV's RANSAC seeds itself anew in every call.
+    OpenCV's RANSAC is reseeded in every call.
     """
     in_b, in_a = _clear_matches(_matcher(a.descriptors), b.descriptors)
     if len(in_b) < 8:
@@ -138,14 +138,14 @@ class Vocabulary:
 
 @dataclass(frozen=True)
 class Closure:
-    """What the detector says of an image: the earlier one that shows its place, if any.
+    """The loop closure of an image, if any.
 
     Attributes
     ----------
     image : int
-        Index of the earlier image; -1 where none is alike.
+        Index of the earlier image of the same place; -1 if none is similar.
     inliers : int
-        Of the epipolar check; the score.
+        Inliers of the epipolar check: the score.
     """
 
     image: int
@@ -170,13 +170,13 @@ def closures(images: Sequence[Features], skip: int, island: int = 7, min_score: 
     Parameters
     ----------
     images : sequence of Features
-        In the order taken.
+        In chronological order.
     skip : int
-        So many images just before one are no loops.
+        Number of directly preceding images that are excluded.
     island : int
-        Images that an island spans at first; published runs have 7 to 11.
+        Initial size of an island, in images; 7 to 11 in the published runs.
     min_score : float
-        Images are considered from this share of the range of scores up; published runs have 0.3.
+        Minimum score of an image, rescaled to 0-1; 0.3 in the published runs.
 
     Returns
     -------
@@ -189,7 +189,7 @@ def closures(images: Sequence[Features], skip: int, island: int = 7, min_score: 
             vocabulary.add(images[i - skip - 1])
         scores = _rescaled(vocabulary.similarity(features))
         islands = _islands(scores, island, min_score)
-        # Islands that go on from that of the last image come first.
+        # Islands that continue that of the previous image take precedence.
         chosen = max(
             [known for known in islands if known.overlaps(previous)] or islands,
             key=lambda known: known.score,
@@ -205,15 +205,15 @@ def closures(images: Sequence[Features], skip: int, island: int = 7, min_score: 
 
 
 def _rescaled(scores: Array) -> Array:
-    """Scores (N,) from 0 at the least to 1 at the greatest; all 0 if they are the same."""
+    """Scores (N,) rescaled to 0-1; all 0 if they are equal."""
     span = float(np.ptp(scores)) if len(scores) else 0.0
     return (scores - scores.min()) / span if span > 0 else np.zeros(len(scores))
 
 
 def _islands(scores: Array, size: int, min_score: float) -> list[_Island]:
-    """Group the images from the best down: one next to an island joins it, another founds one.
+    """Group the images in descending order of score: each joins the island it is in or starts another.
 
-    An island starts ``size`` images wide, less where it meets its neighbours, and its score is the mean
+    An island is ``size`` images wide, fewer where it meets its neighbours, and its score is the mean
     over its images.
     """
     half, bounds = size // 2, list[tuple[int, int]]()
@@ -231,19 +231,20 @@ def _islands(scores: Array, size: int, min_score: float) -> list[_Island]:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """Images of a submap and the vocabulary that they make."""
+    """Images of a submap and their vocabulary."""
 
     images: tuple[Features, ...]
     vocabulary: Vocabulary
 
 
 def methods(scale: Scale) -> list[Method]:
-    """Submaps told by their images: the same words and check, for every two submaps on their own.
+    """Recognise submaps by their images: the same words and check, for each pair of submaps separately.
 
-    Each image of the source asks the vocabulary of the target for the image most alike, and the score is
-    the largest number of epipolar inliers of these pairs of images. There is no transform: one camera
-    does not tell how far it moved. Swept is the contrast that a corner of ORB needs, OpenCV's 20 or 7
-    grey levels, as ORB-SLAM falls back to on faint ground. Nothing depends on the scale of the terrain.
+    For each image of the source the most similar image is looked up in the vocabulary of the target, and
+    the score is the maximum number of epipolar inliers of these pairs of images. There is no transform,
+    as a single camera does not observe the scale of its motion. The sweep is over the minimum contrast of
+    an ORB corner: OpenCV's 20 grey levels, and 7, to which ORB-SLAM falls back on ground of low contrast.
+    Nothing depends on the scale of the terrain.
     """
     return [
         Method(

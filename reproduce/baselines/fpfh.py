@@ -2,7 +2,7 @@
 
 R. B. Rusu et al., "Fast Point Feature Histograms (FPFH) for 3D Registration", ICRA 2009.
 
-Seeded, but it threads by TBB: on more than one processor the last digits may differ from run to run.
+Seeded, but it uses TBB: on more than one processor the last digits may differ from run to run.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from terrainloop.evaluation.baselines.method import Match, Method, Observation, Scale, require
+from reproduce.baselines.method import Match, Method, Observation, Scale, require
 from terrainloop.geometry import transform
 
 # Voxel as a share of the submap's side; radii of normals and of FPFH in voxels. 2 and 5 are the tutorial's;
@@ -48,7 +48,7 @@ def methods(scale: Scale) -> tuple[Method, ...]:
 def _describe(
     package: Any, observation: Observation, *, voxel: float, normal: float, fpfh: float
 ) -> Described:
-    """Thinned to a point a voxel; the normals point up, as our clouds know where that is."""
+    """Downsample to one point per voxel; normals are oriented upwards, as clouds are gravity-aligned."""
     radius = package.geometry.KDTreeSearchParamRadius
     cloud = package.geometry.PointCloud(package.utility.Vector3dVector(observation.submap.points))
     cloud = cloud.voxel_down_sample(voxel)
@@ -58,9 +58,9 @@ def _describe(
 
 
 def _score(package: Any, source: Described, target: Described, *, voxel: float) -> Match:
-    """The feature matches that the pose brings together, once ICP has settled it.
+    """Score by the feature matches consistent with the pose refined by ICP.
 
-    RANSAC's own count is of points that meet; on ground most poses bring most points together.
+    RANSAC's own score counts coinciding points, and on ground most points coincide under most poses.
     """
     registration = package.pipelines.registration
     reach = MATCHING_VOXELS * voxel

@@ -1,20 +1,20 @@
 """What the ground of a simulated world looks like: grain, stones, rocks, sun and shadows.
 
-The look of a point depends on the world, the seed and its position alone, and on the sun. All noise
-hangs on hashed lattices, each turned and shifted at random: nothing repeats itself anywhere.
+The look of a point depends only on the world, the seed, its position and the sun. All noise comes from
+hashed lattices, each rotated and shifted at random, so that nothing is periodic.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import SeedSequence
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
+from reproduce.appearance.looks import LOOKS, Look
+from reproduce.appearance.noise import Image, Lattice, value_noise
+from terrainloop.geometry import Array
 from terrainloop.simulation.terrain import Terrain
-
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 FINEST, COARSEST = 0.002, 4.096  # metres; cells of the finest and the coarsest octave of the albedo
 FAR_BLUR = 0.08  # metres; of the terrain's slope where a pixel sees as much
@@ -30,76 +30,8 @@ def stream(seed: int, *key: int) -> SeedSequence:
 
 
 @dataclass(frozen=True)
-class Look:
-    """How the ground of a world looks.
-
-    Attributes
-    ----------
-    tint : (float, float, float)
-        Mean albedo in red, green and blue.
-    contrast : float
-        Standard deviation of the albedo of each octave of noise, as a share of the mean.
-    roughness : float
-        Standard deviation of the slope that each octave of the grain adds.
-    stones : tuple of (float, float)
-        Cell size in metres and share of cells with a stone in it, whose radius is 0.08-0.2 cells.
-    stone_tone, rock_tone : (float, float)
-        Mean and standard deviation of the albedo of stones and rocks over that of the ground.
-    sky_light : float
-        Share of the light that comes from the sky and reaches shadows, too.
-    """
-
-    tint: tuple[float, float, float]
-    contrast: float
-    roughness: float
-    stones: tuple[tuple[float, float], ...]
-    stone_tone: tuple[float, float]
-    rock_tone: tuple[float, float]
-    sky_light: float
-
-
-_ETNA = Look(
-    tint=(0.15, 0.14, 0.135),
-    contrast=0.035,
-    roughness=0.12,
-    stones=((0.035, 0.6), (0.08, 0.4), (0.18, 0.2)),
-    stone_tone=(1.0, 0.08),
-    rock_tone=(1.1, 0.08),
-    sky_light=0.2,
-)
-_MOROCCO = Look(
-    tint=(0.34, 0.27, 0.20),
-    contrast=0.03,
-    roughness=0.09,
-    stones=((0.035, 0.7), (0.08, 0.6), (0.18, 0.4)),
-    stone_tone=(0.8, 0.2),
-    rock_tone=(0.75, 0.15),
-    sky_light=0.15,
-)
-_MARS = Look(
-    tint=(0.30, 0.20, 0.13),
-    contrast=0.03,
-    roughness=0.09,
-    stones=((0.04, 0.15), (0.10, 0.12)),
-    stone_tone=(0.85, 0.1),
-    rock_tone=(0.8, 0.08),
-    sky_light=0.3,
-)
-_SAND = Look(
-    tint=(0.36, 0.30, 0.22),
-    contrast=0.025,
-    roughness=0.07,
-    stones=(),
-    stone_tone=(1.0, 0.0),
-    rock_tone=(1.0, 0.0),
-    sky_light=0.2,
-)
-LOOKS = {"etna": _ETNA, "morocco": _MOROCCO, "mars": _MARS, "flat": _SAND, "ripples": _SAND}
-
-
-@dataclass(frozen=True)
 class Sun:
-    """Where the sun stands: direction from the ground to it, in degrees; azimuth from x to y."""
+    """Direction from the ground to the sun, in degrees; azimuth from x to y."""
 
     azimuth_deg: float
     elevation_deg: float
@@ -123,7 +55,7 @@ class Light:
 def light(terrain: Terrain, sun: Sun, reach: float = 8.0) -> Light:
     """Cast the shadows of a height field.
 
-    A node lies in a shadow if, within ``reach`` metres towards the sun, the ground rises above its
+    A node is in shadow if, within ``reach`` metres towards the sun, the ground rises above its
     line to it. The greatest rise over 2 k nodes follows from that over k nodes and the same k nodes away,
     so that doubling takes the logarithm of the reach. Borders blur over 2 cm of height, as a
     sun half a degree wide and a camera's pixels blur them.
@@ -190,7 +122,7 @@ class Ground:
         for layer in range(len(self.look.stones)):
             self._add_stones(surface, xy, footprint, light.sun, layer)
         mean, deviation = self.look.rock_tone
-        tone = surface.tone * (1 + rock * (mean - 1 + deviation * _noise(xy, 0.3, self.salt + 30)[0]))
+        tone = surface.tone * (1 + rock * (mean - 1 + deviation * value_noise(xy, 0.3, self.salt + 30)[0]))
         received = self.look.sky_light + (1 - self.look.sky_light) * surface.sunlight(light.sun)
         tint = np.array(self.look.tint, dtype=np.float32)
         # Rocks are a little less coloured than the dust around them.
@@ -204,7 +136,7 @@ class Ground:
             # A cell is half a wave: the mean over one cell leaves half of it, over one and a half little.
             weight = np.clip(1.5 - footprint / np.float32(cell), 0, 1)
             seen = np.flatnonzero(weight)
-            value, along_x, along_y = weight[seen] * _noise(xy[seen], cell, self.salt + octave)
+            value, along_x, along_y = weight[seen] * value_noise(xy[seen], cell, self.salt + octave)
             surface.tone[seen] += np.float32(self.look.contrast) * value
             if cell <= TERRAIN_TAKES_OVER:
                 surface.slope_x[seen] += np.float32(self.look.roughness) * along_x
@@ -216,7 +148,7 @@ class Ground:
         cell, share = self.look.stones[layer]
         salt = self.salt + 40 + 10 * layer
         chosen = np.flatnonzero(footprint < 0.2 * cell)
-        lattice = _Lattice.of(xy[chosen], cell, salt)
+        lattice = Lattice.of(xy[chosen], cell, salt)
         there = lattice.hashed(salt) < share
         chosen, lattice = chosen[there], lattice.only(there)
         x, y, size, tone = (lattice.hashed(salt + k) for k in range(1, 5))
@@ -230,10 +162,10 @@ class Ground:
         mean, deviation = self.look.stone_tone
         surface.tone[chosen] *= 1 + on * (mean - 1 + deviation * UNIFORM * (tone - 0.5))
         steepness = -on * STONE_HEIGHT / np.sqrt(1.1 - np.minimum(rho, 1) ** 2) / radius
-        slope_x, slope_y = lattice.turned_back(steepness * dx, steepness * dy)
+        slope_x, slope_y = lattice.to_world(steepness * dx, steepness * dy)
         surface.slope_x[chosen] += slope_x
         surface.slope_y[chosen] += slope_y
-        shadow = lattice.turned(-sun.direction[:2] / sun.direction[2])
+        shadow = lattice.from_world(-sun.direction[:2] / sun.direction[2])
         surface.lit[chosen] *= 1 - (fade - on) * _in_shadow(dx / radius, dy / radius, shadow)
 
 
@@ -290,79 +222,3 @@ def _at_nodes(layers: Image, terrain: Terrain, xy: Array) -> Image:
     lower = nodes[corner] * (1 - u) + nodes[corner + 1] * u
     upper = nodes[corner + columns] * (1 - u) + nodes[corner + columns + 1] * u
     return np.asarray(lower * (1 - v) + upper * v)
-
-
-def _noise(xy: Array, cell: float, salt: int) -> Image:
-    """Value noise at points (N, 2): its value and its slopes along x and y (3, N), each of unit variance.
-
-    Uniform numbers hashed from the corners of the cells, joined by w(t) = 3 t^2 - 2 t^3. With E[w^2] =
-    13/35 and E[w'^2] = 6/5 the variance is (26/35)^2 / 12, that of a slope 2 (6/5) (26/35) / 12.
-    """
-    lattice = _Lattice.of(xy, cell, salt)
-    a, b = lattice.hashed(salt), lattice.hashed(salt, 1, 0)
-    c, d = lattice.hashed(salt, 0, 1), lattice.hashed(salt, 1, 1)
-    u, v = lattice.u, lattice.v
-    wu, wv = u * u * (3 - 2 * u), v * v * (3 - 2 * v)
-    b, c, d = b - a, c - a, a - b - c + d
-    value = (a - 0.5 + b * wu + c * wv + d * wu * wv) * np.float32(np.sqrt(12) * 35 / 26)
-    scale = np.float32(np.sqrt(12 / (2 * 6 / 5 * 26 / 35)))
-    slopes = lattice.turned_back(
-        scale * 6 * u * (1 - u) * (b + d * wv), scale * 6 * v * (1 - v) * (c + d * wu)
-    )
-    return np.stack([value, *slopes])
-
-
-@dataclass(frozen=True, eq=False)
-class _Lattice:
-    """Where points lie on a lattice of square cells, turned and shifted by its salt.
-
-    Attributes
-    ----------
-    turn : array, (2,)
-        Cosine and sine of its turn against the world.
-    i, j : array, (N,) uint32
-        Cells.
-    u, v : array, (N,) float32
-        Place within the cell, 0-1.
-    """
-
-    turn: Array
-    i: NDArray[np.uint32]
-    j: NDArray[np.uint32]
-    u: Image
-    v: Image
-
-    @classmethod
-    def of(cls, xy: Array, cell: float, salt: int) -> "_Lattice":
-        turn, *shift = 2 * np.pi * np.random.default_rng(salt).random(3)
-        c, s = np.cos(turn), np.sin(turn)
-        x = (c * xy[:, 0] + s * xy[:, 1]) / cell + shift[0]
-        y = (c * xy[:, 1] - s * xy[:, 0]) / cell + shift[1]
-        i, j = np.floor(x), np.floor(y)
-        u, v = (x - i).astype(np.float32), (y - j).astype(np.float32)
-        return cls(
-            np.array([c, s]), i.astype(np.int32).view(np.uint32), j.astype(np.int32).view(np.uint32), u, v
-        )
-
-    def only(self, kept: NDArray[np.bool_]) -> "_Lattice":
-        return _Lattice(self.turn, self.i[kept], self.j[kept], self.u[kept], self.v[kept])
-
-    def hashed(self, salt: int, right: int = 0, up: int = 0) -> Image:
-        """A uniform number in [0, 1) for each cell, or for the one so many further right and up."""
-        h = (self.i + np.uint32(right)) * np.uint32(0x9E3779B1)
-        h ^= (self.j + np.uint32(up)) * np.uint32(0x85EBCA77) + np.uint32(salt % 2**32)
-        for shift, factor in ((15, 0x2C1B3C6D), (12, 0x297A2D39)):  # mixers of lowbias32-type hashes
-            h ^= h >> np.uint32(shift)
-            h *= np.uint32(factor)
-        h ^= h >> np.uint32(15)
-        return np.asarray((h >> np.uint32(8)).astype(np.float32) * np.float32(2**-24))
-
-    def turned(self, vector: Array) -> Array:
-        """A vector (2,) of the world in the frame of the lattice."""
-        c, s = self.turn
-        return np.array([c * vector[0] + s * vector[1], c * vector[1] - s * vector[0]])
-
-    def turned_back(self, x: Image, y: Image) -> tuple[Image, Image]:
-        """Components along the axes of the world of vectors in the frame of the lattice."""
-        c, s = self.turn.astype(np.float32)
-        return c * x - s * y, s * x + c * y

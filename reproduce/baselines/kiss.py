@@ -2,8 +2,8 @@
 
 H. Lim et al., "KISS-Matcher: Fast and Robust Point Cloud Registration Revisited", ICRA 2025.
 
-It threads by TBB, which OMP_NUM_THREADS does not bound: with more than one thread the same pair scores a few
-inliers more or less from run to run. A process pinned to one processor repeats itself to the bit.
+It uses TBB, which OMP_NUM_THREADS does not limit: with more than one thread the score of a pair varies by a
+few inliers from run to run. In a process pinned to one processor it is reproducible to the bit.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrainloop.evaluation.baselines.method import Match, Method, Observation, Scale, require
+from reproduce.baselines.method import Match, Method, Observation, Scale, require
 from terrainloop.geometry import Array
 
 # Voxel as a share of the submap's side; radii of normals and of FPFH in voxels. 3 and 5 are the shipped
@@ -45,16 +45,16 @@ def methods(scale: Scale) -> tuple[Method, ...]:
 
 
 def _config(package: Any, voxel: float, normal: float, fpfh: float) -> Any:
-    """The shipped settings; its bound of 1 m on the noise, meant for streets, is off: ours scale."""
+    """The shipped settings without the noise bound of 1 m, which is meant for streets: ours scale."""
     return package.KISSMatcherConfig(
         voxel, normal_r_gain=normal, fpfh_r_gain=fpfh, enable_noise_bound_clamping=False
     )
 
 
 def _describe(observation: Observation, height: float) -> Cloud:
-    """The cloud as from above its middle: normals are turned towards the origin, as if the sensor was there.
+    """The cloud relative to a viewpoint above its middle: normals are oriented towards the origin.
 
-    A submap's own origin may lie in the ground, and some of its normals would then point down.
+    The origin of a submap may be below the ground, and some normals would then point down.
     """
     points = observation.submap.points
     low, high = points.min(axis=0), points.max(axis=0)

@@ -1,10 +1,10 @@
-"""The random classifier: what a score that knows nothing reaches (paper, Fig. 8)."""
+"""The random classifier (paper, Fig. 8)."""
 
 import zlib
 
 import numpy as np
 
-from terrainloop.evaluation.baselines.method import Match, Method, Observation, Scale
+from reproduce.baselines.method import Match, Method, Observation, Scale
 
 
 def methods(scale: Scale) -> tuple[Method, ...]:

@@ -21,17 +21,17 @@ NOT_COMPARABLE = -np.inf  # score of a pair that a method could not compare
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """All that a method may know of a submap; the truth is not in it.
+    """The data of a submap that a method has access to; ground truth is not included.
 
     Attributes
     ----------
     submap : Submap
     T_odometry_submap : array, (4, 4), or None
-        Its pose by odometry alone.
+        Pose by odometry alone.
     colours : array, (N, 3) uint8, or None
         RGB of the submap's points.
     images : tuple of array, (rows, columns) uint8
-        Left camera images, in the order driven; none for a LiDAR.
+        Left camera images in chronological order; none for a LiDAR.
     """
 
     submap: Submap
@@ -42,14 +42,14 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """What a method says of a pair.
+    """Result of a method for a pair.
 
     Attributes
     ----------
     score : float
-        Higher is surer; `NOT_COMPARABLE` where the method could not compare the two.
+        Higher is more certain; `NOT_COMPARABLE` if the method could not compare the two.
     T_target_source : array, (4, 4)
-        Takes points of source into the frame of target, metres; NaN where the method gives none.
+        Takes points of source into the frame of target, metres; NaN if the method estimates none.
     """
 
     score: float
@@ -63,16 +63,16 @@ class Method:
     Attributes
     ----------
     name : str
-        As tables print it, the same for every choice of settings.
+        Name in the tables, the same for every choice of settings.
     settings : mapping of str to number or str
-        What was chosen, as tables print it.
+        The choice of settings, as shown in the tables.
     software : str
-        Package and version that does the work, or the publication that was followed.
+        Package and version, or the publication that was followed.
     describe : callable
-        Observation -> what is kept of the submap; done once for each, in the order driven.
+        Observation -> description; called once per submap, in chronological order.
     score : callable
-        (kept of source, kept of target) -> Match; the source is the later submap. The same two give the
-        same match, whatever was scored before.
+        (description of source, description of target) -> Match; the source is the later submap. The
+        result does not depend on the pairs scored before.
     """
 
     name: str
@@ -84,14 +84,14 @@ class Method:
 
 @dataclass(frozen=True)
 class Scale:
-    """What the settings of a method are scaled to.
+    """Lengths that the settings of a method are scaled to.
 
     Attributes
     ----------
     spacing : float
         Median distance of a point to its nearest neighbour, metres.
     side : float
-        Root of the median area that a submap's bounding box covers, metres.
+        Median side of a square of the area of a submap's bounding box, metres.
     """
 
     spacing: float
@@ -99,7 +99,7 @@ class Scale:
 
     @classmethod
     def of(cls, submaps: Sequence[Submap]) -> "Scale":
-        """Measured on the submaps of a mission."""
+        """Measure them on the submaps of a mission."""
         sides = [np.sqrt(np.ptp(submap.points[:, :2], axis=0).prod()) for submap in submaps]
         spacings = []
         for submap in submaps:
@@ -114,13 +114,14 @@ def require(module: str, package: str) -> tuple[ModuleType, str]:
     Raises
     ------
     TerrainLoopError
-        If it is not installed, in one line that says how to.
+        If it is not installed or cannot be imported, in one line.
     """
     try:
         return import_module(module), f"{package} {version(package)}"
     except ImportError as error:
+        absent = isinstance(error, ModuleNotFoundError)
         raise TerrainLoopError(
             expected=f"the package {package}, which this baseline runs",
-            found=str(error),
-            mend=f"pip install {package}",
+            found=" ".join(str(error).split()),
+            mend=f"pip install {package}" if absent else "install the system library that it names",
         ) from error

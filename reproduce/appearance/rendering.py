@@ -1,4 +1,4 @@
-"""What the left camera of the rover photographs, and the colours of the points of its clouds."""
+"""Images of the rover's left camera, and colours for the points of its clouds."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -8,13 +8,11 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from terrainloop.geometry import transform
-from terrainloop.simulation.appearance import Ground, Light, Sun, ground_of, light, stream
+from reproduce.appearance.ground import Ground, Light, Sun, ground_of, light, stream
+from terrainloop.geometry import Array, transform
 from terrainloop.simulation.missions import SETUPS, SimulatedMission
 from terrainloop.simulation.sensors import StereoCamera, cast_rays
 from terrainloop.simulation.terrain import Terrain
-
-Array = NDArray[np.float64]
 
 STEP = 4  # pixels between the rays that are cast first
 BEND = 0.02  # second difference of the inverse depth from ray to ray above which each pixel is cast
@@ -26,14 +24,14 @@ NOISE = 1.5  # standard deviation of a pixel at mid-grey, of 255; half of it is 
 
 @dataclass(frozen=True)
 class Sky:
-    """How the sun stands during a drive.
+    """The sun during a drive.
 
     Attributes
     ----------
     elevation_deg : float
-        Of the sun, the whole time.
+        Elevation of the sun, constant.
     turn_deg : float
-        How far its azimuth turns from one submap to the next.
+        Change of its azimuth from one submap to the next.
     """
 
     elevation_deg: float = 35.0
@@ -108,7 +106,7 @@ def photograph(
     """
     origin = T_world_camera[:3, 3]
     v, u = np.arange(camera.height), np.arange(camera.width)
-    directions = _directions(camera, v, u) @ T_world_camera[:3, :3].T
+    directions = camera.directions(v, u) @ T_world_camera[:3, :3].T
     inverse_depth = _inverse_depth(ground, origin, camera, T_world_camera, directions)
     seen = inverse_depth > 0
     depth, towards = 1 / inverse_depth[seen], directions[seen]
@@ -135,15 +133,6 @@ def _exposed(brightness: NDArray[np.float32], mean: float, rng: Generator) -> ND
     return np.clip(np.rint(counts + noise), 0, 255).astype(np.uint8)
 
 
-def _directions(camera: StereoCamera, rows: NDArray[np.int_], columns: NDArray[np.int_]) -> Array:
-    """Directions (rows, columns, 3) of pixels in the frame of the camera, with unit depth."""
-    right, down = np.meshgrid(
-        (columns - 0.5 * (camera.width - 1)) / camera.focal_length,
-        (rows - 0.5 * (camera.height - 1)) / camera.focal_length,
-    )
-    return np.stack([np.ones_like(right), -right, -down], axis=-1)
-
-
 def _inverse_depth(
     ground: Ground, origin: Array, camera: StereoCamera, T_world_camera: Array, directions: Array
 ) -> Array:
@@ -154,7 +143,7 @@ def _inverse_depth(
     and crests every pixel is cast.
     """
     v, u = np.arange(0, camera.height + STEP, STEP), np.arange(0, camera.width + STEP, STEP)
-    coarse = _cast(ground.terrain, origin, _directions(camera, v, u) @ T_world_camera[:3, :3].T)
+    coarse = _cast(ground.terrain, origin, camera.directions(v, u) @ T_world_camera[:3, :3].T)
     bent = np.zeros(coarse.shape, dtype=bool)
     for axis in (0, 1):
         second = np.abs(ndimage.correlate1d(coarse, [1, -2, 1], axis=axis, mode="nearest"))

@@ -2,8 +2,8 @@
 
 S. Gupta et al., "Effectively Detecting Loop Closures using Point Cloud Density Maps", ICRA 2024.
 
-Its RANSAC draws from the machine's random device and cannot be seeded: scores of the same pair may differ
-by a few inliers from run to run.
+Its RANSAC is seeded from the random device of the system: the score of a pair may vary by a few inliers from
+run to run.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from terrainloop.evaluation.baselines.method import Match, Method, Observation, Scale, require
+from reproduce.baselines.method import Match, Method, Observation, Scale, require
 from terrainloop.geometry import Array, inverse
 
 # Pixels along a submap's side: the published 0.5 m has about 400 along a local map of 100 m range. The share
@@ -50,7 +50,7 @@ def _config(package: Any, resolution: float, threshold: float) -> Any:
 
 
 def _describe(package: Any, observation: Observation, *, resolution: float) -> LocalMap:
-    """Thinned as its pipeline thins a local map; about z = 0, where it looks for the ground to align with."""
+    """Downsample as its pipeline does a local map, and centre at z = 0, where it searches for the ground."""
     points = observation.submap.points
     low, high = points.min(axis=0), points.max(axis=0)
     middle = np.array([*(low + high)[:2] / 2, np.median(points[:, 2])])
@@ -60,7 +60,7 @@ def _describe(package: Any, observation: Observation, *, resolution: float) -> L
 
 
 def _score(package: Any, config: Any, source: LocalMap, target: LocalMap) -> Match:
-    """Inliers in a database of its own for every pair, as scores are not to depend on one another."""
+    """Score by inliers, with a separate database for every pair, so that scores are independent."""
     database = package.MapClosures(config)
     database.get_best_closure(TARGET_ID, target.points)
     closure = database.get_best_closure(SOURCE_ID, source.points)

@@ -5,18 +5,19 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from terrainloop.geometry import inverse, se3, transform
-from terrainloop.simulation.appearance import LOOKS, Ground, Sun, _noise, ground_of, light
-from terrainloop.simulation.missions import SETUPS, simulate_mission
-from terrainloop.simulation.rendering import (
+from reproduce.appearance.ground import Ground, Sun, ground_of, light
+from reproduce.appearance.looks import LOOKS
+from reproduce.appearance.noise import value_noise
+from reproduce.appearance.rendering import (
     GREY,
     Sky,
-    _directions,
     _inverse_depth,
     colours_of,
     images_of,
     photograph,
 )
+from terrainloop.geometry import inverse, se3, transform
+from terrainloop.simulation.missions import SETUPS, simulate_mission
 from terrainloop.simulation.sensors import StereoCamera, cast_rays
 from terrainloop.simulation.terrain import WORLDS, Terrain, make_terrain
 
@@ -49,28 +50,28 @@ def _detail(image):
 
 def _depth(T_world_camera):
     v, u = np.arange(CAMERA.height), np.arange(CAMERA.width)
-    directions = _directions(CAMERA, v, u) @ T_world_camera[:3, :3].T
+    directions = CAMERA.directions(v, u) @ T_world_camera[:3, :3].T
     return directions, _inverse_depth(_ground(), T_world_camera[:3, 3], CAMERA, T_world_camera, directions)
 
 
 def test_noise_has_unit_variance_and_slopes_that_are_its_differences():
     xy = np.random.default_rng(0).uniform(-40, 40, (200_000, 2))
-    value, along_x, along_y = _noise(xy, 0.1, 7)
+    value, along_x, along_y = value_noise(xy, 0.1, 7)
     assert np.abs(value.mean()) < 0.01
     np.testing.assert_allclose([value.std(), along_x.std(), along_y.std()], 1.0, atol=0.01)
     step = np.array([1e-4, 0.0])
     for slope, shift in ((along_x, step), (along_y, step[::-1])):
-        difference = _noise(xy + shift, 0.1, 7)[0] - _noise(xy - shift, 0.1, 7)[0]
+        difference = value_noise(xy + shift, 0.1, 7)[0] - value_noise(xy - shift, 0.1, 7)[0]
         assert _correlation(difference, slope) > 0.999
 
 
 def test_texture_does_not_repeat_itself():
     n = 1024  # a strip of 10 m by 0.5 m at 1 cm, against itself at every shift from 0.3 m on
     y, x = np.mgrid[:50, :n] * 0.01
-    value = _noise(np.stack([x.ravel(), y.ravel()], axis=-1), 0.04, 1)[0].reshape(50, n)
+    value = value_noise(np.stack([x.ravel(), y.ravel()], axis=-1), 0.04, 1)[0].reshape(50, n)
     shifts = [_correlation(value[:, : n - k], value[:, k:]) for k in range(30, n - 100)]
     assert np.abs(shifts).max() < 0.35
-    assert _correlation(value, _noise(np.stack([x.ravel(), y.ravel()], -1), 0.04, 2)[0]) < 0.1
+    assert _correlation(value, value_noise(np.stack([x.ravel(), y.ravel()], -1), 0.04, 2)[0]) < 0.1
 
 
 def test_a_wall_casts_a_shadow_as_long_as_trigonometry_says():

@@ -1,4 +1,4 @@
-"""Scan Context, written from its publication.
+"""Scan Context, implemented from its publication.
 
 G. Kim and A. Kim, "Scan Context: Egocentric Spatial Descriptor for Place Recognition within 3D Point Cloud
 Map", IROS 2018. A submap is cut into rings and sectors about its centre; each bin keeps its highest point.
@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from terrainloop.evaluation.baselines.method import Match, Method, Observation, Scale
+from reproduce.baselines.method import Match, Method, Observation, Scale
 from terrainloop.geometry import Array, se3, transform
 
 RINGS, SECTORS = 20, 60  # as published
@@ -25,7 +25,7 @@ class ScanContext:
     Attributes
     ----------
     heights : array, (RINGS, SECTORS)
-        Of the highest point of each bin above the lowest of the submap, metres; 0 where a bin is empty.
+        Height of the highest point of each bin above the lowest point of the submap, metres; 0 if empty.
     centre : array, (3,)
         Middle of the submap in x and y, its lowest point in z, in its frame, metres.
     """
