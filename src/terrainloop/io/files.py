@@ -1,5 +1,6 @@
 """Files that are written completely or not at all."""
 
+import contextlib
 import errno
 import io
 import os
@@ -38,7 +39,8 @@ def write_whole(path: str | Path, write: Callable[[IO[bytes]], object]) -> None:
         raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
     finally:
         if not special:
-            aside.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # where its folder is none
+                aside.unlink()
 
 
 def write_whole_text(path: str | Path, write: Callable[[TextIO], object]) -> None:

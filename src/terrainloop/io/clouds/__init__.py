@@ -60,8 +60,8 @@ def read_cloud(path: str | Path, stamp: float = 0.0) -> Submap:
     try:
         with np.errstate(all="ignore"):  # what overflows becomes infinite, and is dropped as such
             table = reader(path)
+            check_points(max(map(len, table.columns.values()), default=0), path.stat().st_size)
             points, intensity = _cloud_of(table.columns)
-            check_points(len(points), path.stat().st_size)
             for repair in table.repairs:
                 logger.warning("%s: %s", path.stem, repair)
             return Submap(points, name=path.stem, stamp=stamp, intensity=intensity, repairs=table.repairs)

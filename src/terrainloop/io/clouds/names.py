@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 
 from terrainloop.errors import TerrainLoopError
-from terrainloop.io.clouds.table import COMMENTS, INTENSITY, cells_of, is_number
+from terrainloop.io.clouds.table import INTENSITY, cells_of, is_comment, is_number
 
 _METRES = r"m|met(?:er|re)s?"
 _UNITS = rf"{_METRES}|mm|cm|dm|km|ft|feet|foot|us-?ft|in|inch(?:es)?|deg(?:rees?)?|rad|px|pixels?"
@@ -37,23 +37,29 @@ _MEANINGS = (
 _PATTERNS = tuple((meaning, re.compile(pattern)) for meaning, pattern in _MEANINGS)
 
 
-def columns_of(header: Sequence[str], width: int) -> dict[str, int] | None:
+def columns_of(header: Sequence[str], width: int, spare: bool) -> dict[str, int] | None:
     """Columns of x, y, z and, where there is one, the intensity, among `width`; None where none are named.
+
+    Where the last column is `spare`, that is empty throughout, it needs no name.
 
     Raises
     ------
     TerrainLoopError
         Where a line may name columns, but not clearly one each.
     """
-    named = [columns for line in header if (columns := _columns_in(line, width)) is not None]
+    named = [columns for line in header if (columns := _columns_in(line, width, spare)) is not None]
     if any(columns != named[0] for columns in named):
         raise _not_understood(header[-1], width)
     return named[0] if named else None
 
 
-def _columns_in(line: str, width: int) -> dict[str, int] | None:
-    commented = line.startswith(COMMENTS)
-    cells, delimited = _cells_in(line.lstrip("#/% "), width)
+def _columns_in(line: str, width: int, spare: bool) -> dict[str, int] | None:
+    commented = is_comment(line)
+    cells, delimited = _cells_in(line.lstrip("#/% "))
+    if len(cells) == width + 1 and not cells[-1]:
+        cells.pop()
+    if len(cells) == width - 1 and spare:
+        cells.append("")
     meanings = [_meaning(cell) for cell in cells]
     axes, known = _axes(meanings), sum(map(bool, meanings))
     listed = len(cells) >= 3 and 2 * known > len(cells)  # few words of a sentence are known names
@@ -73,15 +79,13 @@ def _columns_in(line: str, width: int) -> dict[str, int] | None:
     return None
 
 
-def _cells_in(line: str, width: int) -> tuple[list[str], bool]:
+def _cells_in(line: str) -> tuple[list[str], bool]:
     """The line split by its own separator, and whether that is more than a blank."""
     line = re.sub(r" {2,}", " ", line)
     line = re.sub(r" ([\[({<])", r"\1", line)  # x [m] is one name
     line = re.sub(r"^(?:columns?|fields?|format|header|names?)[ ]?[:=]", "", line, flags=re.IGNORECASE)
     delimiter = next((mark for mark in ";\t," if mark in line), None)
     cells = [cell.strip(" \t\"'") for cell in cells_of(line, delimiter)]
-    if len(cells) == width + 1 and not cells[-1]:
-        cells.pop()
     return cells or [""], delimiter is not None
 
 

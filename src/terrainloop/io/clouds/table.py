@@ -16,20 +16,20 @@ INTENSITY = ("intensity", "reflectivity", "scalar_intensity")
 WIDEST = 32
 """Unnamed columns that a cloud can have; what is wider is a raster of heights."""
 
-COMMENTS = ("#", "//", "%")
-"""How a line above a body begins that is no part of it."""
+LONGEST_HEADER = 1 << 16
+"""Bytes of a header in text."""
 
 PADDING = b"\0\t\n\r "
 """Bytes that may follow the last point."""
 
-_LONGEST_HEADER = 1 << 16  # bytes
 _ANY_POINTS = 1_000_000  # a file may hold so many points however small it is ...
 _POINTS_PER_BYTE = 2  # ... and so many for each of its bytes; real clouds take a byte per point at least
-_COMMENT = re.compile(r"(?:^|\s)(?:#|//).*")
+_COMMENT = re.compile(r"(?:^%|(?:^|\s)(?:#(?![A-Z]+[!?/])|//)).*")  # but not the #N/A of spreadsheets
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 _COUNT = re.compile(r"[0-9]{1,18}")
 _MISSING = re.compile(
-    r"[-+]?(?:1\.?#\w+|[qs]?nan\d*(?:\(\w*\))?)|#[\w/!?]+|null|nil|none|n/?a|no[ _-]?data|missing|[-*?.]*",
+    r"[-+]?(?:1\.?#\w+|inf(?:inity)?|[qs]?nan\d*(?:\(\w*\))?)|#[\w/!?]+|[-*?.]*"
+    r"|null|nil|none|n/?a|no[ _-]?data|missing",
     re.ASCII | re.IGNORECASE,
 )
 
@@ -63,7 +63,7 @@ def count_of(word: str) -> int:
 
 def split_header(data: bytes, last: bytes) -> tuple[list[list[str]], int]:
     """Words of each line of a text header down to the line `last`, and where the body starts."""
-    end = re.search(rb"[\r\n][ \t]*%b\b[^\r\n]*(\r*\n|\r)" % last, data[:_LONGEST_HEADER], re.IGNORECASE)
+    end = re.search(rb"[\r\n][ \t]*%b\b[^\r\n]*(\r*\n|\r)" % last, data[:LONGEST_HEADER], re.IGNORECASE)
     if end is None:
         raise ValueError(f"no header that ends with a line {last.decode()}")
     header = data[: end.start(1)]
@@ -74,15 +74,24 @@ def split_header(data: bytes, last: bytes) -> tuple[list[list[str]], int]:
 
 
 def lines_of(text: bytes) -> list[str]:
-    """Lines that are not blank, stripped; what is not ASCII is replaced, so that it is never a number."""
+    """Lines that are not blank; what is not ASCII is replaced, so that it is never a number."""
     lines = text.decode("ascii", "replace").replace("\r", "\n").split("\n")
-    return [line for line in map(str.strip, lines) if line]
+    return [line for line in map(_strip, lines) if line.strip()]
+
+
+def is_comment(line: str) -> bool:
+    """Whether a line is a comment from its start."""
+    return _COMMENT.match(line) is not None
 
 
 def without_comments(lines: Sequence[str]) -> list[str]:
     """Lines without what follows ``#`` or ``//`` at their start or after a blank."""
-    stripped = (_COMMENT.sub("", line).strip() if "#" in line or "//" in line else line for line in lines)
-    return [line for line in stripped if line]
+    stripped = (_strip(_COMMENT.sub("", line)) if re.search("[#%/]", line) else line for line in lines)
+    return [line for line in stripped if line.strip()]
+
+
+def _strip(line: str) -> str:
+    return line.strip(" ")  # a tab may separate cells of which the first or last is empty
 
 
 def cells_of(line: str, delimiter: str | None) -> list[str]:

@@ -7,11 +7,12 @@ from pathlib import Path
 from terrainloop.errors import TerrainLoopError
 from terrainloop.io.clouds.names import columns_of
 from terrainloop.io.clouds.table import (
-    COMMENTS,
+    LONGEST_HEADER,
     WIDEST,
     Table,
     cells_of,
     check_count,
+    is_comment,
     is_missing,
     is_number,
     lines_of,
@@ -43,13 +44,18 @@ def _read(text: bytes) -> Table:
     header, body = lines[:start], without_comments(lines[start:])
     if not body:
         raise ValueError("no line of three numbers")
-    if header and re.fullmatch(r"[0-9]{1,18}", header[0]):  # PTS
+    if header and re.fullmatch(r"[0-9]{1,18}", header[0].strip()):  # PTS
         check_count(int(header.pop(0)), len(body))
-    delimiter = next((mark for mark in ";\t," if mark in body[0]), None)
-    if delimiter and all(line.endswith(delimiter) for line in body):
-        body = [line[:-1] for line in body]
+    if sum(map(len, header)) > LONGEST_HEADER:
+        raise ValueError(f"more than {LONGEST_HEADER} characters above the first line of numbers")
+    delimiter = _delimiter(body[0])
+    if delimiter != "\t":
+        body = [line.strip() for line in body]
     width = len(cells_of(body[0], delimiter))
-    columns = columns_of(header, width)
+    if width < 3:
+        raise ValueError(f"{width} values in the line {body[0]!r}")
+    spare = delimiter is not None and all(line.endswith(delimiter) for line in body)
+    columns = columns_of(header, width, spare)
     if columns is None:
         _check_unnamed(body, delimiter, width)
         columns = {"x": 0, "y": 1, "z": 2}
@@ -57,12 +63,17 @@ def _read(text: bytes) -> Table:
     return Table(dict(zip(columns, table.T, strict=True)))
 
 
+def _delimiter(line: str) -> str | None:
+    return next((mark for mark in ";\t," if mark in line.strip()), None)
+
+
 def _is_row(line: str) -> bool:
     """Whether a line is no comment and holds three numbers or more, or marks that they are missing."""
-    if line.startswith(COMMENTS):
+    if is_comment(line):
         return False
-    cells = [cell for cell in re.split(r"[;,\s\"]+", line) if cell]
-    return sum(is_number(cell) or is_missing(cell) for cell in cells) >= 3
+    cells = [cell.strip(' "') for cell in cells_of(line, _delimiter(line))]
+    filled = sum(is_number(cell) or (cell != "" and is_missing(cell)) for cell in cells)
+    return filled >= 3 or (filled > 0 and filled + cells.count("") >= 3)
 
 
 def _check_unnamed(body: Sequence[str], delimiter: str | None, width: int) -> None:
