@@ -57,8 +57,9 @@ def crs_of(path: Path) -> int | str | None:
     """EPSG code where the file states one, else WKT, else None."""
     with _open(path) as reader:
         wkt, keys = _wkt(reader.header), _geo_keys(reader.header)
-    # The outermost authority is the last entry of the outermost bracket.
-    authority = re.search(r'(?:AUTHORITY\["EPSG",\s*"|ID\["EPSG",\s*)(\d+)"?\s*\]\s*\]\s*$', wkt)
+    # Its own authority is the last entry of a system, which ends the text or stands before that of heights.
+    epsg = r'(?:AUTHORITY\["EPSG",\s*"|ID\["EPSG",\s*)(\d+)"?\s*\]\s*\]\s*(?:$|,\s*VERT)'
+    authority = re.search(epsg, wkt)
     if authority:
         return int(authority[1])
     code = keys.get(_PROJECTED, 0)
