@@ -66,6 +66,7 @@ NAMED = {
     "a sentence without commas": "# here x points forward y left z up\n" + _lines(X, Y, Z, TIME),
     "a sentence above three": "# z is up\n" + _lines(X, Y, Z),
     "a sentence with as many words": "# exported 2024-05-01 by v1.2\n" + _lines(X, Y, Z, TIME),
+    "a sentence with two commas": "# x forward, y left, z up\n" + _lines(X, Y, Z),
     "a note on the names": "# x, y and z are in metres\n" + _lines(X, Y, Z),
     "nothing": _lines(X, Y, Z, TIME, TIME),
 }
@@ -88,6 +89,9 @@ UNCLEAR = {
     "unknown names": "t,a,b,c\n" + _commas(TIME, X, Y, Z),
     "unknown names of three": "a,b,c\n" + _commas(X, Y, Z),
     "unknown names in a comment": "# zeit rechts hoch hoehe\n" + _lines(TIME, X, Y, Z),
+    "unknown names between commas": "# my time, to the right, ahead, above\n" + _lines(TIME, X, Y, Z),
+    "unknown names between semicolons": "# ahead;to the right;above\n" + _lines(Y, X, Z),
+    "unknown systems": "# Y_utm X_utm Z_utm\n" + _lines(Y, X, Z),
     "names of two": "t,x,y,height_above_ground\n" + _commas(TIME, X, Y, Z),
     "degrees": "longitude,latitude,altitude\n" + _commas(X, Y, Z),
     "degrees, shorter": "# lon lat alt\n" + _lines(X, Y, Z),

@@ -1,6 +1,6 @@
 """GeoTIFF files as other programs read them."""
 
-from xml.etree import ElementTree
+from xml.etree import ElementTree as ET
 from xml.sax.saxutils import unescape
 
 import numpy as np
@@ -99,7 +99,7 @@ def test_no_value_where_ground_is_not_known(tmp_path, bands):
 @pytest.mark.parametrize("names", [("elevation", "slope"), ("a & b <c>", 'h\u00f6he "m"')])
 def test_gdal_has_the_names_of_bands(tmp_path, names):
     write_geotiff(tmp_path / "a.tif", dict.fromkeys(names, np.zeros(SHAPE)), ORIGIN, RESOLUTION)
-    items = ElementTree.fromstring(_tags(tmp_path / "a.tif")[42112])
+    items = ET.fromstring(_tags(tmp_path / "a.tif")[42112])
     assert items.tag == "GDALMetadata"
     assert [(item.get("name"), item.get("role"), item.get("sample")) for item in items] == [
         ("DESCRIPTION", "description", "0"),

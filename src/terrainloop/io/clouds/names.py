@@ -33,6 +33,7 @@ _MEANINGS = (
         r"t|time.*|stamp|.*timestamp|gps_?time|n?secs?|id|idx|index|row|[enhuv]|label|class(?:ification)?",
     ),
     (_OTHER, r"(?:point|pt)[ _-]*(?:id|no|nr|number)|ring|channel|returns?|confidence|curvature"),
+    (_OTHER, r"[xyz](?:[_.-]\w+|\d)"),
 )
 _PATTERNS = tuple((meaning, re.compile(pattern)) for meaning, pattern in _MEANINGS)
 
@@ -55,38 +56,39 @@ def columns_of(header: Sequence[str], width: int, spare: bool) -> dict[str, int]
 
 def _columns_in(line: str, width: int, spare: bool) -> dict[str, int] | None:
     commented = is_comment(line)
-    cells, delimited = _cells_in(line.lstrip("#/% "))
+    cells, delimiter = _cells_in(line.lstrip("#/% "))
     if len(cells) == width + 1 and not cells[-1]:
         cells.pop()
     if len(cells) == width - 1 and spare:
         cells.append("")
+    fits = len(cells) == width
     meanings = [_meaning(cell) for cell in cells]
     axes, known = _axes(meanings), sum(map(bool, meanings))
     listed = len(cells) >= 3 and 2 * known > len(cells)  # few words of a sentence are known names
-    if axes and len(cells) == width:
-        # A sentence can have as many words as there are columns, and three of them be x, y and z.
-        if not commented or delimited or listed or list(axes.values()) == [0, 1, 2]:
-            intensity = next((meanings.index(name) for name in INTENSITY if name in meanings), None)
-            return axes if intensity is None else axes | {"intensity": intensity}
-        raise _not_understood(line, width)
+    # A sentence can have as many words as there are columns, and three of them be x, y and z.
+    if fits and axes and (not commented or delimiter or listed or list(axes.values()) == [0, 1, 2]):
+        intensity = next((meanings.index(name) for name in INTENSITY if name in meanings), None)
+        return axes if intensity is None else axes | {"intensity": intensity}
     if commented:
-        words = all(re.match(r"[A-Za-z][\w.]*$", cell) for cell in cells)
-        refused = listed or (width > 3 and len(cells) == width and words)
+        # Above three columns, a few words are a note, and commas may be those of a sentence.
+        words = all(re.fullmatch(r"[A-Za-z][\w.]*", cell) for cell in cells)
+        names = (delimiter or words) if width > 3 else (delimiter in (";", "\t") or (delimiter and words))
+        unclear = listed or (fits and bool(axes or names))
     else:  # a title is harmless only above three columns
-        refused = width > 3 or known > 0 or len(cells) == width or is_number(cells[0])
-    if refused:
+        unclear = fits or width > 3 or known > 0 or is_number(cells[0])
+    if unclear:
         raise _not_understood(line, width)
     return None
 
 
-def _cells_in(line: str) -> tuple[list[str], bool]:
-    """The line split by its own separator, and whether that is more than a blank."""
+def _cells_in(line: str) -> tuple[list[str], str | None]:
+    """The line split by its own delimiter, and that, None for blanks."""
     line = re.sub(r" {2,}", " ", line)
     line = re.sub(r" ([\[({<])", r"\1", line)  # x [m] is one name
     line = re.sub(r"^(?:columns?|fields?|format|header|names?)[ ]?[:=]", "", line, flags=re.IGNORECASE)
     delimiter = next((mark for mark in ";\t," if mark in line), None)
     cells = [cell.strip(" \t\"'") for cell in cells_of(line, delimiter)]
-    return cells or [""], delimiter is not None
+    return cells or [""], delimiter
 
 
 def _meaning(cell: str) -> str:
