@@ -16,14 +16,17 @@ from terrainloop.io.rasters import write_geotiff
 
 SUFFIXES = ("ply", "npy", "npz", "xyz")
 LIMITED = """
-import resource, sys
+import csv, resource, sys
 import numpy as np
 from terrainloop.io import write_cloud
+from terrainloop.io.files import write_whole_text
 from terrainloop.io.rasters import write_geotiff
 resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
 path = sys.argv[1]
 try:
-    if path.endswith("tif"):
+    if path.endswith("csv"):
+        write_whole_text(path, lambda file: csv.writer(file).writerows([range(9)] * 9999))
+    elif path.endswith("tif"):
         write_geotiff(path, {"a": np.random.default_rng(0).normal(size=(90, 90))}, (0, 0), 0.1)
     else:
         write_cloud(path, np.random.default_rng(0).normal(size=(900, 3)))
@@ -36,12 +39,12 @@ def _names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-@pytest.mark.parametrize("suffix", [*SUFFIXES, "tif"])
+@pytest.mark.parametrize("suffix", [*SUFFIXES, "tif", "csv"])
 def test_a_full_disk_leaves_nothing_behind_and_names_the_file(tmp_path, suffix):
     path = tmp_path / f"a.{suffix}"
     path.write_text("what was there")
     run = subprocess.run([sys.executable, "-c", LIMITED, path], capture_output=True, text=True, check=True)
-    assert run.stdout == f"{path}\tFile too large\n"
+    assert (run.stdout, run.stderr) == (f"{path}\tFile too large\n", "")
     assert path.read_text() == "what was there"
     assert _names(tmp_path) == [path.name]
 
@@ -99,6 +102,12 @@ def test_whatever_ends_the_writing_leaves_what_was_there(tmp_path):
         write_whole(tmp_path / "a", write)
     assert (tmp_path / "a").read_bytes() == b"old"
     assert _names(tmp_path) == ["a"]
+
+
+def test_longest_names(tmp_path):
+    path = tmp_path / ("a" * 251 + ".npy")
+    write_cloud(path, ground())
+    assert len(read_cloud(path)) == 400
 
 
 def test_text(tmp_path):

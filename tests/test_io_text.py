@@ -105,6 +105,8 @@ UNCLEAR = {
     "a grid": "ncols 4\nnrows 400\ncellsize 1\n" + _lines(X, Y, Z, TIME),
     "another count of points": "399\n" + _lines(X, Y, Z),
     "a sentence or names": "# x forward y left z up\n" + _lines(TIME, TIME, TIME, X, Y, Z),
+    "another format": "OFF\n400 0 0\n" + _lines(X, Y, Z),
+    "UTF-16": "".join(f"{c}\0" for c in "x,y,z\n" + _commas(X, Y, Z)),
     "separated by bars": "t|x|y|z\n" + _lines(TIME, X, Y, Z),
     "velocities": "vx,vy,vz,px\n" + _commas(TIME, X, Y, Z),
     "less in the first line": "1.0 2.0\n" + _lines(X, Y, Z),

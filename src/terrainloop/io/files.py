@@ -1,12 +1,13 @@
 """Files that are written completely or not at all."""
 
+import codecs
 import contextlib
 import errno
-import io
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, TextIO
+from typing import IO, TextIO, cast
 
 
 def write_whole(path: str | Path, write: Callable[[IO[bytes]], object]) -> None:
@@ -28,7 +29,7 @@ def write_whole(path: str | Path, write: Callable[[IO[bytes]], object]) -> None:
     """
     target = Path(os.path.realpath(path))
     special = target.exists() and not target.is_file()
-    aside = target if special else target.with_name(f".{target.name}.{os.getpid()}")
+    aside = target if special else target.with_name(f".{os.getpid()}-{threading.get_ident()}.part")
     try:
         with aside.open("wb") as file:
             write(file)
@@ -47,9 +48,7 @@ def write_whole_text(path: str | Path, write: Callable[[TextIO], object]) -> Non
     """Write a text file in UTF-8 as `write_whole` does; line ends stay as written."""
 
     def encode(file: IO[bytes]) -> None:
-        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
-        write(text)
-        text.flush()
-        text.detach()
+        # Unlike io.TextIOWrapper it keeps nothing back that its finaliser would try to write again.
+        write(cast(TextIO, codecs.getwriter("utf-8")(file)))
 
     write_whole(path, encode)

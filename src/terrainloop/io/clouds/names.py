@@ -74,8 +74,8 @@ def _columns_in(line: str, width: int, spare: bool) -> dict[str, int] | None:
         words = all(re.fullmatch(r"[A-Za-z][\w.]*", cell) for cell in cells)
         names = (delimiter or words) if width > 3 else (delimiter in (";", "\t") or (delimiter and words))
         unclear = listed or (fits and bool(axes or names))
-    else:  # a title is harmless only above three columns
-        unclear = fits or width > 3 or known > 0 or is_number(cells[0])
+    else:  # only a title of several words above three columns is harmless; one word is that of a format
+        unclear = fits or width > 3 or known > 0 or is_number(cells[0]) or len(cells) == 1
     if unclear:
         raise _not_understood(line, width)
     return None
