@@ -22,16 +22,16 @@ from terrainloop.io import write_cloud
 from terrainloop.io.files import write_whole_text
 from terrainloop.io.rasters import write_geotiff
 resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
-path = sys.argv[1]
-try:
-    if path.endswith("csv"):
-        write_whole_text(path, lambda file: csv.writer(file).writerows([range(9)] * 9999))
-    elif path.endswith("tif"):
-        write_geotiff(path, {"a": np.random.default_rng(0).normal(size=(90, 90))}, (0, 0), 0.1)
-    else:
-        write_cloud(path, np.random.default_rng(0).normal(size=(900, 3)))
-except OSError as error:
-    print(error.filename, error.strerror, sep="\\t")
+for path in sys.argv[1:]:
+    try:
+        if path.endswith("csv"):
+            write_whole_text(path, lambda file: csv.writer(file).writerows([range(9)] * 9999))
+        elif path.endswith("tif"):
+            write_geotiff(path, {"a": np.random.default_rng(0).normal(size=(90, 90))}, (0, 0), 0.1)
+        else:
+            write_cloud(path, np.random.default_rng(0).normal(size=(900, 3)))
+    except OSError as error:
+        print(error.filename, error.strerror)
 """
 
 
@@ -39,14 +39,15 @@ def _names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-@pytest.mark.parametrize("suffix", [*SUFFIXES, "tif", "csv"])
-def test_a_full_disk_leaves_nothing_behind_and_names_the_file(tmp_path, suffix):
-    path = tmp_path / f"a.{suffix}"
-    path.write_text("what was there")
-    run = subprocess.run([sys.executable, "-c", LIMITED, path], capture_output=True, text=True, check=True)
-    assert (run.stdout, run.stderr) == (f"{path}\tFile too large\n", "")
-    assert path.read_text() == "what was there"
-    assert _names(tmp_path) == [path.name]
+def test_a_full_disk_leaves_nothing_behind_and_names_the_file(tmp_path):
+    paths = [tmp_path / f"a.{suffix}" for suffix in sorted([*SUFFIXES, "tif", "csv"])]
+    for path in paths:
+        path.write_text("what was there")
+    run = subprocess.run([sys.executable, "-c", LIMITED, *paths], capture_output=True, text=True, check=True)
+    assert run.stdout == "".join(f"{path} File too large\n" for path in paths)
+    assert run.stderr == ""
+    assert [path.read_text() for path in paths] == ["what was there"] * len(paths)
+    assert _names(tmp_path) == [path.name for path in paths]
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")

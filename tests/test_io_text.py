@@ -141,8 +141,8 @@ MISSING = [
 ]
 
 
-@pytest.mark.parametrize("separator", [" ", ",", ";", "\t"])
-@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("separator", [" ", ",", "\t"])
+@pytest.mark.parametrize("axis", [0, 2])
 @pytest.mark.parametrize("missing", [*MISSING, ""])
 def test_points_without_a_value_are_dropped_openly(tmp_path, missing, axis, separator):
     if separator == " " and missing in ("", "#N/A"):
