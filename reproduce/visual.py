@@ -14,7 +14,7 @@ from reproduce.baselines.ibow import closures, features_of
 from reproduce.kept import code_key, is_current
 from reproduce.missions import FRAMES_FILE, Drive
 from terrainloop.geometry import yaw_of
-from terrainloop.io.results import write_whole
+from terrainloop.io.files import write_whole_text
 
 SKIPPED = 14  # images just before one: two submaps of 7 m, as pairs of neighbours are left out
 NEAR = 2.0  # metres between two cameras that are at the same place
@@ -50,7 +50,7 @@ class Frames:
         record = file.with_suffix(".json")
         if not (file.exists() and is_current(record, key)):
             _write(drive, file, skipped)
-            write_whole(record, lambda output: json.dump({"key": key}, output))
+            write_whole_text(record, lambda output: json.dump({"key": key}, output))
         with file.open(newline="", encoding="utf-8") as lines:
             rows = list(DictReader(lines))
         closed, inliers = (np.array([int(row[key]) for row in rows]) for key in ("closed", "inliers"))
@@ -89,4 +89,4 @@ def _write(drive: Drive, file: Path, skipped: int) -> None:
     features = [features_of(image) for name in drive.mission.names for image in drive.images(name)]
     found = closures(features, skipped)
     lines = ["image,closed,inliers", *(f"{i},{one.image},{one.inliers}" for i, one in enumerate(found))]
-    write_whole(file, lambda output: output.write("\n".join(lines) + "\n"))
+    write_whole_text(file, lambda output: output.write("\n".join(lines) + "\n"))

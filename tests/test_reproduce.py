@@ -17,7 +17,7 @@ from reproduce.results import Result, best_of_each
 from reproduce.runner import read_pairs, run_all, tasks_of
 from reproduce.visual import Frames
 from terrainloop.errors import TerrainLoopError
-from terrainloop.io.results import write_whole
+from terrainloop.io.files import write_whole_text
 from terrainloop.io.trajectories import Trajectory, read_trajectory, write_tum
 
 METHODS = """
@@ -206,7 +206,7 @@ def test_half_a_file_is_never_left(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_whole(path, fail)
+        write_whole_text(path, fail)
     assert path.read_text() == "old"
 
 

@@ -52,7 +52,7 @@ def command(
         progress("map", 0, 1)
         gradient_map = map_submap(submap, settings, workers=worker_count(workers)).gradient_map
         progress("map", 1, 1)
-    _write(gradient_map, output)
+    _write(gradient_map, output, cloud)
     written = [str(output)]
     if png:
         from terrainloop.report.figures import figure_map, save_figure
@@ -93,12 +93,20 @@ def _show(console: Console, submap: "Submap", gradient_map: "GradientMap", writt
     )
 
 
-def _write(gradient_map: "GradientMap", output: Path) -> None:
+def _write(gradient_map: "GradientMap", output: Path, cloud: Path) -> None:
     if output.suffix.lower() == ".npz":
         gradient_map.save(output)
         return
+    from terrainloop.io.clouds import read_crs
     from terrainloop.io.rasters import write_geotiff
 
     bands = ("elevation", "gradient_x", "gradient_y", "magnitude", "variance", "gradient_variance")
     images = {name: getattr(gradient_map, name) for name in bands}
-    write_geotiff(output, images, gradient_map.origin, gradient_map.resolution)
+    write_geotiff(
+        output,
+        images,
+        gradient_map.origin,
+        gradient_map.resolution,
+        mask=gradient_map.mask,
+        crs=read_crs(cloud),
+    )

@@ -24,8 +24,8 @@ from terrainloop.evaluation.precision_recall import (
 from terrainloop.evaluation.retrieval import Retrieval, retrieval
 from terrainloop.evaluation.truth import MIN_OVERLAP, GroundTruth
 from terrainloop.geometry import Array, inverse
+from terrainloop.io.files import write_whole_text
 from terrainloop.io.missions import load_mission, read_sessions
-from terrainloop.io.results import write_whole
 from terrainloop.io.trajectories import read_trajectory
 from terrainloop.loop import LoopCandidate
 
@@ -330,7 +330,7 @@ def _write_rows(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]
     def write(file: TextIO) -> None:
         csv.writer(file).writerows([columns, *rows])
 
-    write_whole(path, write)
+    write_whole_text(path, write)
 
 
 def _median(values: Sequence[float]) -> float:
