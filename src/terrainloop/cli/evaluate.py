@@ -63,11 +63,11 @@ def command(
     from terrainloop.evaluation.precision_recall import precision_recall
     from terrainloop.io.missions import read_sessions
     from terrainloop.io.results import read_loops, read_submaps
-    from terrainloop.io.trajectories import read_trajectory
+    from terrainloop.io.submap_poses import read_submap_poses
 
     terminal = Terminal.open(as_json, quiet, verbose)
     candidates, records = read_loops(run / "pairs.csv"), read_submaps(run / "submaps.csv")
-    poses = read_trajectory(truth).poses
+    poses = read_submap_poses(truth, [record.name for record in records]).poses
     pairs = judge(
         candidates,
         records,
