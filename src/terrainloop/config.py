@@ -71,7 +71,7 @@ class MatchSettings(_Frozen):
         "evidence", description="evidence: false alarms expected by chance; inliers: Algorithm 1 of the paper"
     )
     max_false_loops: float = Field(
-        0.01, ge=1e-12, le=1e6, description="evidence: false loops to be expected in a whole mission"
+        0.01, gt=0, le=1e6, description="evidence: false loops to be expected in a whole mission"
     )
     iterations: int = Field(5000, ge=1, le=10**7, description="pairs of keypoint associations drawn")
     inlier_radius: float | None = Field(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrainloop import _core
+from terrainloop.arrays import ReadOnlyArrays, read_only
 from terrainloop.errors import TerrainLoopError
 
 # A map's contrast: the magnitude that all but its steepest hundredth stay below. Thresholds and grey
@@ -26,7 +27,7 @@ _Detected = tuple[NDArray[np.float64], NDArray[Any]]
 
 
 @dataclass(frozen=True, eq=False)
-class Features:
+class Features(ReadOnlyArrays):
     """Keypoints of one gradient map and their descriptors, strongest first.
 
     Parameters
@@ -53,6 +54,10 @@ class Features:
     responses: NDArray[np.float64]
     descriptors: NDArray[np.float32] | NDArray[np.uint8]
     kind: str
+
+    def __post_init__(self) -> None:
+        for name in ("positions", "scales", "orientations", "responses", "descriptors"):
+            object.__setattr__(self, name, read_only(np.asarray(getattr(self, name))))
 
     def __len__(self) -> int:
         return len(self.positions)

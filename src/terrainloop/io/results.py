@@ -33,7 +33,7 @@ class SubmapRecord:
         Corners, anticlockwise, of the convex hull of x and y in the submap's own frame, metres, rounded to
         millimetres; none where broken.
     notes : str
-        Repairs, or what is wrong.
+        Repairs and warnings, or what is wrong.
     """
 
     name: str
@@ -49,7 +49,8 @@ def submap_record(submap: Submap) -> SubmapRecord:
     xy = submap.points[:, :2]
     corners = xy[ConvexHull(xy - xy[0]).vertices]
     hull = np.round(corners, 3) + 0.0  # no negative zeros
-    return SubmapRecord(submap.name, submap.stamp, len(submap), "ok", hull, "; ".join(submap.repairs))
+    notes = "; ".join([*submap.repairs, *submap.warnings])
+    return SubmapRecord(submap.name, submap.stamp, len(submap), "ok", hull, notes)
 
 
 def write_submaps(path: str | Path, records: Iterable[SubmapRecord]) -> None:
