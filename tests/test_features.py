@@ -1,5 +1,7 @@
 """Keypoints of gradient maps: metres, the map's sense of rotation, masks, and the same for all kinds."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -59,6 +61,15 @@ def test_bump_is_found_in_metres(kind):
     features = extract(bump, np.ones(bump.shape, bool), kind=kind, max_keypoints=1)
     np.testing.assert_allclose(features.positions, [[x, y]], atol=0.2 * RESOLUTION)
     assert 0.6 < features.scales[0] / sigma < 1.4
+
+
+@all_kinds
+def test_arrays_are_read_only(kind):
+    features = extract(bumps(), kind=kind, max_keypoints=20)
+    for each in (features, pickle.loads(pickle.dumps(features))):
+        for name in ("positions", "scales", "orientations", "responses", "descriptors"):
+            with pytest.raises(ValueError, match="read-only"):
+                getattr(each, name)[0] = 0
 
 
 @all_kinds
