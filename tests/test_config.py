@@ -154,6 +154,7 @@ def test_no_yaml_is_refused(file, content):
         ("match: !!set {a, b}", "match"),
         ("'speed limit': 1", "speed limit"),
         (f"{'x' * 1000}: 1", "xxx"),
+        ('"a\\nb\\e[31m": 1', "ab[31m:"),
     ],
 )
 def test_values_of_another_type_or_size_are_refused_by_key(file, content, key):

@@ -386,6 +386,8 @@ def test_a_map_is_saved_whole_or_not_at_all(tmp_path, bumpy, monkeypatch):
         ({"parameters": (0.4, 0.1, 0.01)}, "Hyperparameters"),
         ({"parameters": Hyperparameters(0.4, 0.1, 0.0)}, "positive"),
         ({"parameters": Hyperparameters(1e-9, 0.1, 0.1)}, "squares of the length scale"),
+        ({"parameters": Hyperparameters(1e6, 0.1, 0.1)}, "pixels within a length scale"),
+        ({"resolution": 1e-9}, "pixels within a length scale"),
     ],
 )
 def test_maps_made_by_hand_are_checked(bumpy, changes, said):

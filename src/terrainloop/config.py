@@ -142,7 +142,7 @@ class Settings(_Frozen):
             return cls.model_validate({} if content is None else content, strict=True)
         except ValidationError as error:
             first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"]) or "the file"
+            where = "".join(c for c in ".".join(map(str, first["loc"])) if c.isprintable()) or "the file"
             raise TerrainLoopError(
                 expected=f"valid settings in {path}",
                 found=f"{where[:_LONGEST_QUOTE]}: {first['msg'].lower()[:_LONGEST_QUOTE]}",

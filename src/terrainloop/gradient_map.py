@@ -26,6 +26,7 @@ MAX_PIXELS = 20_000_000
 
 _IMAGES = ("elevation", "gradient_x", "gradient_y", "variance", "gradient_variance")
 _LARGEST = 1e12  # of any number of a map: its square is far from the end of single precision
+_FINEST = 1e4  # pixels of a length scale; filters of that width are slow, and there is no use for them
 _LITTLE = 0.05  # share of observed pixels below which something is wrong with the points
 
 
@@ -93,6 +94,8 @@ class GradientMap(ReadOnlyArrays):
         area = mask.size * (resolution / length_scale) ** 2
         limit = f"at most {MAX_LENGTH_SCALES:.0e} squares of the length scale"
         _require(area <= MAX_LENGTH_SCALES, limit, f"{area:.3g}")
+        pixels = length_scale / resolution
+        _require(pixels <= _FINEST, f"at most {_FINEST:.0e} pixels within a length scale", f"{pixels:.3g}")
         object.__setattr__(self, "mask", read_only(mask))
         object.__setattr__(self, "origin", origin)
         object.__setattr__(self, "resolution", resolution)

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal
 from itertools import pairwise
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +32,15 @@ _INTEGER = r"\d+"
 _COMPOUND = (
     r"\d+(?:[-_.:,T hm]+\d+)*"  # dates, times, seconds and nanoseconds: one quantity in several fields
 )
-_MONTH = r"(?i)(?<![a-z])(jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)[a-z]*(?![a-z])"
-_DAY_FIRST = r"(?<!\d)\d{1,2}([-_.])\d{1,2}\1(?:19|20)\d\d(?!\d)"
+_COUNTING_WORD = (  # in no order of letters; abbreviated or not
+    r"(?i)(?<![a-z])(jan(?:uary)?|feb(?:ruary)?|mar(?:ch)?|apr(?:il)?|may|june?|july?|aug(?:ust)?|sept?(?:ember)?"
+    r"|oct(?:ober)?|nov(?:ember)?|dec(?:ember)?|(?:mon|tues?|wed(?:nes)?|thu(?:rs)?|fri|sat(?:ur)?|sun)(?:day)?"
+    r"|spring|summer|autumn|winter|morning|noon|afternoon|evening|night"
+    r"|one|two|three|four|five|six|seven|eight|nine|ten|first|second|third|fourth|fifth|last"
+    r"|[ivx]{1,4})(?![a-z])"
+)
+_DAY_FIRST = r"(?<!\d)(?:\d{1,2}([-_.])\d{1,2}\1|(?:0[1-9]|[12]\d|3[01])(?:0[1-9]|1[0-2]))(?:19|20)\d\d(?!\d)"
+_SHORT_YEAR = r"(?<!\d)(\d{1,2})([-_.])(\d{1,2})\2(\d\d)(?!\d)"  # 15-01-24, or 24-01-15
 _TWELVE_HOURS = r"(?i)\d *[ap]m(?![a-z])"
 _HEXADECIMAL = r"(|.*[^0-9a-f])([0-9a-f]+)"
 
@@ -90,14 +98,19 @@ def _by_name(names: Sequence[str]) -> tuple[Order, str]:
         if other != ordered:
             at = next(i for i, (a, b) in enumerate(zip(ordered, other, strict=True)) if a != b)
             return order, f"{_short(ordered[at])} before {_short(other[at])} by name, after it {reading}"
-    return order, _not_in_time(ordered) or _without_order(ordered, natural)
+    return order, _unordered_notation(ordered) or _without_order(ordered, natural)
 
 
 def _readings(names: Sequence[str], sign: str, minus: str, natural: Key) -> Iterator[tuple[str, Key]]:
     """What else the names may mean."""
     yield "as version numbers", _key(sign + _INTEGER)
     yield "as negative numbers", _key(minus + f"(?:{_DECIMAL})")
-    yield "ignoring case", lambda name: natural(name.casefold())
+    yield "ignoring case and forms of letters", lambda name: natural(normalize("NFKC", name).casefold())
+    dates = [re.search(_SHORT_YEAR, name) for name in names]
+    days_first = {d.string: (int(d[4]), int(d[3]), int(d[1]), d.string) for d in dates if d}
+    years, months, days, _ = zip(*(days_first.values() or [4 * (0,)]), strict=True)
+    if len(days_first) == len(names) and max(years) - min(years) < 2 and max(months) < 13 and max(days) < 32:
+        yield "as a date that begins with the day", days_first.__getitem__
     counters = {name: list(re.finditer(sign + _COMPOUND, name)) for name in names}
     if all(counters.values()):
         last = {name: natural(found[-1].group()) for name, found in counters.items()}
@@ -112,13 +125,17 @@ def _readings(names: Sequence[str], sign: str, minus: str, natural: Key) -> Iter
             yield "as hexadecimal numbers", values.__getitem__
 
 
-def _not_in_time(names: Sequence[str]) -> str:
-    """Notations of time that no order of letters or numbers follows."""
-    for pattern, notation in ((_MONTH, "months"), (_DAY_FIRST, "days first"), (_TWELVE_HOURS, "am and pm")):
+def _unordered_notation(names: Sequence[str]) -> str:
+    """Notations of time and number that no order of letters or numbers follows."""
+    for pattern, notation in (
+        (_COUNTING_WORD, "counting words"),
+        (_DAY_FIRST, "dates from the day on"),
+        (_TWELVE_HOURS, "am or pm"),
+    ):
         found = {match.group(): name for name in names if (match := re.search(pattern, name))}
         if len(found) > 1:
             first, *_, last = found.values()
-            return f"dates with {notation}, {_short(first)} and {_short(last)}"
+            return f"{notation} in {_short(first)} and {_short(last)}"
     return ""
 
 
