@@ -217,6 +217,7 @@ def test_comments_do_not_come_from_docstrings():
 def test_no_file_is_refused(tmp_path):
     refusal(tmp_path / "absent.yaml")
     refusal(tmp_path)
+    refusal(None)
 
 
 def test_unknown_preset_is_refused():

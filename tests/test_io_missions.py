@@ -96,6 +96,13 @@ def test_a_mission_is_a_folder(tmp_path, kind):
         load_mission(path)
 
 
+@pytest.mark.parametrize("path", [None, 3, ["m"], "a\0b", "x" * 5000])
+def test_what_is_no_path_is_no_mission(path):
+    with pytest.raises(TerrainLoopError, match="mission folder") as caught:
+        load_mission(path)
+    assert len(str(caught.value)) < 500
+
+
 def test_an_empty_folder_lists_what_was_looked_for(tmp_path):
     (tmp_path / "passes.csv").write_text("cloud,pass\n")
     with pytest.raises(TerrainLoopError, match=r"\*\.ply \*\.pcd \*\.las \*\.laz \*\.npy \*\.npz \*\.xyz\)"):
@@ -179,6 +186,17 @@ def test_poses_inverse_to_the_odometry_are_refused(tmp_path):
     write_tum(tmp_path / "truth.tum", Trajectory(stamps, poses))
     with pytest.raises(TerrainLoopError, match="inverse poses"):
         load_mission(tmp_path)
+
+
+def test_trajectories_that_move_in_different_ways_are_reported(tmp_path, caplog):
+    _mission(tmp_path, [f"{k:02d}.npy" for k in range(12)])
+    write_tum(tmp_path / "odometry.tum", Trajectory(np.arange(12.0), _drive()))
+    write_tum(tmp_path / "truth.tum", Trajectory(np.arange(12.0), _drive()[[0, 10, 11, *range(1, 10)]]))
+    load_mission(tmp_path)
+    assert not caplog.records  # neighbours are still neighbours
+    write_tum(tmp_path / "truth.tum", Trajectory(np.arange(12.0), _drive()[::-1]))
+    load_mission(tmp_path)
+    assert ["steps" in record.getMessage() for record in caplog.records] == [True]
 
 
 def test_odometry_that_looks_inverse_is_reported(tmp_path, caplog):

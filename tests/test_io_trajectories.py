@@ -99,6 +99,12 @@ def test_errors_name_file_line_and_columns(tmp_path, text, line, said):
     assert len(str(caught.value)) < 400 + len(str(path))
 
 
+@pytest.mark.parametrize("path", [None, 3, ["t.tum"]])
+def test_what_is_no_path_is_refused(path):
+    with pytest.raises(TerrainLoopError, match="trajectory"):
+        read_trajectory(path)
+
+
 @pytest.mark.parametrize("content", [None, b"\xff\xfe\x00\x01\x80"])
 def test_files_that_are_no_text_are_refused(tmp_path, content):
     path = tmp_path / "bad.tum"

@@ -25,14 +25,14 @@ def read_yaml(path: Path | str) -> Any:
     TerrainLoopError
         If the file cannot be read as that, or is larger than any file of settings.
     """
-    path = Path(path)
     try:
+        path = Path(path)
         if path.exists() and not path.is_file():
             raise ValueError("not a regular file")  # a pipe would block
         if path.stat().st_size > _LARGEST:
             raise ValueError(f"{path.stat().st_size} bytes, more than {_LARGEST}")
         return yaml.load(path.read_text(encoding="utf-8-sig"), _Loader)
-    except (OSError, ValueError, OverflowError, yaml.YAMLError) as error:
+    except (OSError, TypeError, ValueError, OverflowError, yaml.YAMLError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise TerrainLoopError(
             expected=f"YAML settings in {path}",

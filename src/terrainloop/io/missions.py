@@ -137,13 +137,13 @@ def load_mission(path: str | Path) -> Mission:
         Where there is no folder, no cloud, no clear order though there are poses, or a trajectory that does
         not fit: another number of poses, frames that are not gravity-aligned, inverse poses.
     """
-    path = Path(path)
-    if not path.is_dir():
+    if not isinstance(path, str | os.PathLike) or not os.path.isdir(path):  # noqa: PTH112, which raises
         raise TerrainLoopError(
             expected="a mission folder",
-            found=f"{'a file' if path.exists() else 'nothing'} at {path}",
+            found=f"no folder at {path!s:.300}",
             mend="give the folder that holds the clouds",
         )
+    path = Path(path)
     files = _cloud_files(path)
     sources = {name: file for name in ("odometry", "truth") if (file := _side_file(path, name))}
     trajectories = {name: read_trajectory(file) for name, file in sources.items()}

@@ -39,7 +39,10 @@ _COUNTING_WORD = (  # in no order of letters; abbreviated or not
     r"|one|two|three|four|five|six|seven|eight|nine|ten|first|second|third|fourth|fifth|last"
     r"|[ivx]{1,4})(?![a-z])"
 )
-_DAY_FIRST = r"(?<!\d)(?:\d{1,2}([-_.])\d{1,2}\1|(?:0[1-9]|[12]\d|3[01])(?:0[1-9]|1[0-2]))(?:19|20)\d\d(?!\d)"
+_DAY_FIRST = (  # 15-01-2024, 15012024
+    r"(?<!\d)(?<!\d[-_.])(?:\d{1,2}([-_.])\d{1,2}\1|(?:0[1-9]|[12]\d|3[01])(?:0[1-9]|1[0-2]))"
+    r"(?:19|20)\d\d(?!\d)"
+)
 _SHORT_YEAR = r"(?<!\d)(\d{1,2})([-_.])(\d{1,2})\2(\d\d)(?!\d)"  # 15-01-24, or 24-01-15
 _TWELVE_HOURS = r"(?i)\d *[ap]m(?![a-z])"
 _HEXADECIMAL = r"(|.*[^0-9a-f])([0-9a-f]+)"

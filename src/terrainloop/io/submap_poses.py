@@ -24,6 +24,7 @@ TILTED = np.radians(30.0)
 _DOUBTFUL = np.radians(10.0)  # reported, not refused
 _EXPLAINED = np.radians(5.0)  # refused where the quaternions with w first are upright to a tenth of that
 _SAME = 0.3  # share of a step by which odometry and truth may differ, drift included
+_DIFFERENT = 0.5  # share of a step that neither drift nor slip explains
 _LONGER = 2.0  # path length over that of the inverse poses at which one suspects them to be inverse
 _FEWEST = 4  # poses from which a path is judged
 
@@ -105,9 +106,10 @@ def check_consistent(trajectory: Trajectory, other: Trajectory | None, path: str
     """Look for inverse poses, T_submap_world: they are as upright as the poses themselves.
 
     Where another trajectory of the same submaps is known, inverse poses are those whose inverses alone move
-    as the other one does, and are refused. Otherwise the path is measured: the origin of the world, as seen
-    from a rover that drives and turns, travels further than the rover. That is reported only, for a rover
-    that circles the origin of the world is an exception; straight drives show nothing.
+    as the other one does, and are refused; trajectories that move in different ways are reported.
+    Otherwise the path is measured: the origin of the world, as seen from a rover that drives and turns,
+    travels further than the rover. That is reported only, for a rover that circles the origin of the world
+    is an exception; straight drives show nothing.
 
     Raises
     ------
@@ -124,6 +126,13 @@ def check_consistent(trajectory: Trajectory, other: Trajectory | None, path: str
                 found=f"inverse poses, T_submap_world, in {path} or in the other trajectory of the mission: "
                 "only inverted do the two agree",
                 mend="invert the poses of that file",
+            )
+        if as_given > _DIFFERENT:
+            logger.warning(
+                "%s: its steps and those of the other trajectory differ by %.0f %% in the median: "
+                "are both in the order of the clouds, in metres and of the same frames?",
+                path,
+                100 * as_given,
             )
     length, length_inverted = _length(trajectory.poses), _length(inverted)
     if length > _LONGER * length_inverted:

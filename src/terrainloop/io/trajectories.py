@@ -94,6 +94,10 @@ def read_trajectory(path: str | Path) -> Trajectory:
         Naming the file, the line and the columns expected. Quaternions and rotation matrices are refused
         where their norms are further from one than rounded digits explain.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise TerrainLoopError(
+            expected="the path of a trajectory", found=f"{path!r:.60}", mend="give a TUM or KITTI file"
+        )
     path = Path(path)
     lines, table = _table(path)
     translations = table[:, 1:4] if table.shape[1] == _TUM else table[:, 3::4]
