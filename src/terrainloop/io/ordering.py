@@ -109,23 +109,43 @@ def _readings(names: Sequence[str], sign: str, minus: str, natural: Key) -> Iter
     yield "as version numbers", _key(sign + _INTEGER)
     yield "as negative numbers", _key(minus + f"(?:{_DECIMAL})")
     yield "ignoring case and forms of letters", lambda name: natural(normalize("NFKC", name).casefold())
-    dates = [re.search(_SHORT_YEAR, name) for name in names]
-    days_first = {d.string: (int(d[4]), int(d[3]), int(d[1]), d.string) for d in dates if d}
-    years, months, days, _ = zip(*(days_first.values() or [4 * (0,)]), strict=True)
-    if len(days_first) == len(names) and max(years) - min(years) < 2 and max(months) < 13 and max(days) < 32:
-        yield "as a date that begins with the day", days_first.__getitem__
-    counters = {name: list(re.finditer(sign + _COMPOUND, name)) for name in names}
-    if all(counters.values()):
-        last = {name: natural(found[-1].group()) for name, found in counters.items()}
-        if len(set(last.values())) == len(names):
-            yield "by the last number alone", last.__getitem__
-    hexadecimal = [re.fullmatch(_HEXADECIMAL, name.casefold()) for name in names]
-    found = [match for match in hexadecimal if match]
+    for reading, values in (
+        ("by the last number alone", _last_numbers(names, sign, natural)),
+        ("as a date that begins with the day", _days_first(names)),
+        ("as hexadecimal numbers", _hexadecimal(names)),
+    ):
+        if values:
+            yield reading, values.__getitem__
+
+
+def _last_numbers(names: Sequence[str], sign: str, natural: Key) -> dict[str, Any]:
+    """The last number of each name, where all have one of their own: it may be the counter."""
+    found = {name: re.findall(sign + _COMPOUND, name) for name in names}
+    if not all(found.values()):
+        return {}
+    last = {name: natural(numbers[-1]) for name, numbers in found.items()}
+    return last if len(set(last.values())) == len(names) else {}
+
+
+def _days_first(names: Sequence[str]) -> dict[str, Any]:
+    """Year, month and day of each name, where all may be such a date of much the same year."""
+    found = [match for name in names if (match := re.search(_SHORT_YEAR, name))]
+    dates = [(int(match[4]), int(match[3]), int(match[1])) for match in found]
+    if len(dates) < len(names):
+        return {}
+    (first, _, _), (last, _, _) = min(dates), max(dates)
+    possible = last - first < 2 and all(month <= 12 and day <= 31 for _, month, day in dates)
+    return dict(zip(names, dates, strict=True)) if possible else {}
+
+
+def _hexadecimal(names: Sequence[str]) -> dict[str, Any]:
+    """The value of each name, where all end in hexadecimal digits, of which some are letters and some not."""
+    found = [match for name in names if (match := re.fullmatch(_HEXADECIMAL, name.casefold()))]
     digits = "".join(match[2] for match in found)
-    if len({match[1] for match in found}) == 1 and len(found) == len(names) and re.search("[a-f]", digits):
-        values = {name: int(match[2], 16) for name, match in zip(names, found, strict=True)}
-        if re.search(r"\d", digits):
-            yield "as hexadecimal numbers", values.__getitem__
+    of_one_name = len(found) == len(names) and len({match[1] for match in found}) == 1
+    if not of_one_name or digits.isdigit() or digits.isalpha():
+        return {}
+    return {name: int(match[2], 16) for name, match in zip(names, found, strict=True)}
 
 
 def _unordered_notation(names: Sequence[str]) -> str:
