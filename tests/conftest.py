@@ -1,6 +1,6 @@
 """A small synthetic world, known in closed form, that the tests from map to command line share."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -40,6 +40,14 @@ def with_match(settings, **changes):
 
 
 BY_INLIERS = with_match(STRICT, decision="inliers")
+
+
+def with_pixels(gradient_map, pixels, **values):
+    """The map with other values at some pixels."""
+    images = {name: getattr(gradient_map, name).copy() for name in values}
+    for name, image in images.items():
+        image[pixels] = values[name]
+    return replace(gradient_map, **images)
 
 
 @dataclass(frozen=True, eq=False)

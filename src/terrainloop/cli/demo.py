@@ -43,11 +43,12 @@ def command(
     from terrainloop.evaluation.truth import MIN_OVERLAP, GroundTruth
     from terrainloop.io.missions import load_mission
     from terrainloop.report import INSTALL_FIGURES, can_draw
-    from terrainloop.simulation.missions import simulate_mission, write_mission
+    from terrainloop.simulation.missions import simulate_mission, write_mission, written_before
 
     terminal = Terminal.open(as_json, quiet, verbose)
     settings = Settings().with_max_false_loops(max_false_loops)
     folder = output / "mission"
+    written_before(folder)  # refuses before the work
     folder.mkdir(parents=True, exist_ok=True)
     with terminal.progress() as progress:
         simulated = simulate_mission(

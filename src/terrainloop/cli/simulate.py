@@ -19,10 +19,11 @@ def command(
     verbose: Verbose = False,
 ) -> None:
     """Simulate a rover's drive over rough ground: clouds, odometry.tum that drifts, truth.tum."""
-    from terrainloop.simulation.missions import simulate_mission, write_mission
+    from terrainloop.simulation.missions import simulate_mission, write_mission, written_before
 
     terminal = Terminal.open(as_json, quiet, verbose)
     output.mkdir(parents=True, exist_ok=True)
+    written_before(output)  # refuses before the work
     with terminal.progress() as progress:
         mission = simulate_mission(
             world, seed, submaps, sensor, progress=lambda done, total: progress("submaps", done, total)

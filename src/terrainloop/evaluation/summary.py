@@ -26,7 +26,7 @@ from terrainloop.evaluation.truth import MIN_OVERLAP, GroundTruth
 from terrainloop.geometry import Array, inverse
 from terrainloop.io.files import write_whole_text
 from terrainloop.io.missions import load_mission, read_sessions
-from terrainloop.io.trajectories import read_trajectory
+from terrainloop.io.submap_poses import read_submap_poses
 from terrainloop.loop import LoopCandidate
 
 OVERLAP_BANDS = ((0.1, 0.3), (0.3, 1.0))  # IoU; the paper's two thresholds bound them
@@ -208,7 +208,9 @@ def evaluate_run(
     with np.errstate(invalid="ignore"):  # an infinite angle is refused when its pair is evaluated
         candidates = list(found.pairs())
     known = GroundTruth(
-        found.submaps, read_trajectory(truth).poses, None if sessions is None else read_sessions(sessions)
+        found.submaps,
+        read_submap_poses(truth, [record.name for record in found.submaps]).poses,
+        None if sessions is None else read_sessions(sessions),
     )
     if clouds is not None:
         known = replace(known, observed=_observed_overlap(clouds, known))

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.overlap import box_iou, world_boxes
 from terrainloop.geometry import Array
+from terrainloop.io.submap_poses import check_upright
+from terrainloop.io.trajectories import Trajectory
 from terrainloop.record import SubmapRecord
 
 MIN_OVERLAP = 0.3  # IoU above which a pair is a true match (paper, section VI-A)
 MAX_COORDINATE = 1e9  # metres; beyond it a coordinate is an error, not a place on a planet
 MAX_SKEW = 1e-2  # largest entry of R R' - I that rounded digits explain
-MAX_TILT = float(np.deg2rad(45.0))  # frames of submaps are gravity-aligned
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,13 +137,7 @@ def _check_poses(poses: Array, records: Sequence[SubmapRecord]) -> None:
                 found=f"no such pose for {shown(record.name)}",
                 mend="correct that line of the truth",
             )
-        if pose[2, 2] < np.cos(MAX_TILT):
-            raise TerrainLoopError(
-                expected="true poses of gravity-aligned frames, z up",
-                found=f"a tilt of {np.degrees(np.arccos(np.clip(pose[2, 2], -1, 1))):.0f} deg "
-                f"for {shown(record.name)}",
-                mend="write quaternions as qx qy qz qw, w last, and poses of the submaps' own frames",
-            )
+    check_upright(Trajectory(np.arange(len(poses), dtype=float), np.asarray(poses)), "the truth")
 
 
 def is_rigid(T: Array) -> bool:
