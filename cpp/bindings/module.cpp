@@ -115,12 +115,13 @@ nb::list gp_predict_at(const Doubles& xy, const Doubles& elevation, const Double
   });
 }
 
-auto gp_noise_ratio(const Doubles& xy, const Doubles& elevation, double cell, int threads) {
+auto gp_noise_ratio(const Doubles& xy, const Doubles& elevation, double cell, double smallest_scatter,
+                    int threads) {
   const gp::Points points = points_view(xy, elevation, elevation);
   std::vector<double> ratio(points.count);
   {
     nb::gil_scoped_release release;
-    gp::noise_ratio(points.xy, points.elevation, points.count, cell, ratio.data(), threads);
+    gp::noise_ratio(points.xy, points.elevation, points.count, cell, smallest_scatter, ratio.data(), threads);
   }
   return to_numpy(std::move(ratio), {points.count, 1});
 }
@@ -168,7 +169,7 @@ NB_MODULE(TERRAINLOOP_MODULE, module) {
   module.def("gp_predict_at", &terrainloop::gp_predict_at, "xy"_a, "elevation"_a, "noise"_a, nb::kw_only(),
              "length_scale"_a, "variance"_a, "queries"_a, "threads"_a = 1);
   module.def("gp_noise_ratio", &terrainloop::gp_noise_ratio, "xy"_a, "elevation"_a, nb::kw_only(), "cell"_a,
-             "threads"_a = 1);
+             "smallest_scatter"_a = 0.0, "threads"_a = 1);
   module.def("gp_block_likelihood", &terrainloop::gp_block_likelihood, "surfaces"_a, nb::kw_only(),
              "length_scale"_a, "variance"_a, "noise"_a, "side"_a, "work"_a, "threads"_a = 1);
   module.def("fast_hessian", &terrainloop::fast_hessian, "image"_a, "filter_size"_a);

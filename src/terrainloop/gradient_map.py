@@ -13,17 +13,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from terrainloop.arrays import ReadOnlyArrays, read_only
 from terrainloop.errors import TerrainLoopError
+from terrainloop.gp.checks import check_positive
+from terrainloop.gp.grid import Grid
 from terrainloop.gp.hyperparameters import FIT_POINTS
 from terrainloop.gp.kernel import Array, Hyperparameters
-from terrainloop.gp.process import MAX_LENGTH_SCALES, ElevationProcess, Solver, check_positive
-from terrainloop.gp.surface import Surface
+from terrainloop.gp.process import MAX_LENGTH_SCALES, ElevationProcess, Solver
+from terrainloop.gp.training import TrainingData
 from terrainloop.io.files import write_whole
+from terrainloop.resources import check_memory, memory_errors
 from terrainloop.submap import Submap
 
 Image = NDArray[np.float32]
 
 PIXELS_PER_LENGTH_SCALE = 6  # keeps the field's interpolation error below its noise
 MAX_PIXELS = 20_000_000
+BYTES_PER_PIXEL = 32  # at the peak, with the magnitude and temporary arrays (tests/test_memory.py)
 FAR = 10.0  # radii of the map, from which its frame's origin is no longer near it
 
 _IMAGES = ("elevation", "gradient_x", "gradient_y", "variance", "gradient_variance")
@@ -164,6 +168,7 @@ class GradientMap(ReadOnlyArrays):
         max_variance_ratio: float = 0.25,
         seed: int = 0,
         workers: int = 1,
+        max_memory: float | None = None,
     ) -> "GradientMap":
         """Gaussian-process map of a cloud, over its bounding box in x and y.
 
@@ -187,7 +192,7 @@ class GradientMap(ReadOnlyArrays):
         fit_points : int or None
             Of these, drawn for the fit; None: all (see `fit_hyperparameters`).
         remove_plane : bool
-            Take the best plane out before and give its slope back after.
+            Subtract the best plane before and add its slope back after.
         local_noise : bool
             Scale each point's noise by the scatter and the number of the points around it (see
             `terrainloop.gp.spline.noise_ratio`); not done where noise is given for each point.
@@ -196,17 +201,19 @@ class GradientMap(ReadOnlyArrays):
         max_variance_ratio : float
             Ground counts as known where its variance is below this share of the prior's.
         seed : int
-            Of the draw.
+            Seed of the random draws.
         workers : int
             Threads; the result does not depend on it.
+        max_memory : float, optional
+            Bytes that the map may take while it is made; what the machine has available if not given.
 
         Raises
         ------
         TerrainLoopError
-            If the points make no submap, a number is impossible, the grid would be absurdly large, or
-            the equations cannot be solved.
+            If the points do not make a submap, a number is impossible, the map would not fit into memory,
+            or the equations cannot be solved.
         """
-        check_positive(resolution=resolution)
+        check_positive(resolution=resolution, max_memory=max_memory, max_variance_ratio=max_variance_ratio)
         process = ElevationProcess.from_points(
             points,
             length_scale,
@@ -223,16 +230,18 @@ class GradientMap(ReadOnlyArrays):
         parameters = process.parameters
         if resolution is None:
             resolution = parameters.length_scale / PIXELS_PER_LENGTH_SCALE
-        origin, shape = _grid(process.surface, resolution, origin, shape)
-        field = process.predict_grid(origin, resolution, shape)
-        images = {name: image.astype(np.float32, copy=False) for name, image in vars(field).items()}
-        return cls(
-            **images,
-            mask=field.variance < np.float32(max_variance_ratio * parameters.variance),
-            origin=origin,
-            resolution=float(resolution),
-            parameters=parameters,
-        )
+        grid = _grid(process.data, float(resolution), origin, shape)
+        _check_memory(process, grid, max_memory)
+        field = process.predict_grid(grid.origin, grid.resolution, grid.shape)
+        with memory_errors("a gradient map"):
+            images = {name: image.astype(np.float32, copy=False) for name, image in vars(field).items()}
+            return cls(
+                **images,
+                mask=field.variance < np.float32(max_variance_ratio * parameters.variance),
+                origin=grid.origin,
+                resolution=grid.resolution,
+                parameters=parameters,
+            )
 
     @property
     def local_origin(self) -> Array:
@@ -351,32 +360,56 @@ def _number(name: str, value: Any) -> float:
 
 
 def _grid(
-    surface: Surface,
+    data: TrainingData,
     resolution: float,
     origin: tuple[float, float] | None,
     shape: tuple[int, int] | None,
-) -> tuple[tuple[float, float], tuple[int, int]]:
-    """Origin and shape of the grid; by default it covers the points' bounding box."""
-    low, high = surface.xy.min(axis=0) + surface.centre[:2], surface.xy.max(axis=0) + surface.centre[:2]
-    corner = low if origin is None else np.asarray(origin, dtype=np.float64)
+) -> Grid:
+    """The grid of a map; by default it covers the points' bounding box."""
+    low, high = data.xy.min(axis=0) + data.centre[:2], data.xy.max(axis=0) + data.centre[:2]
+    corner = low if origin is None else _pair("origin", origin, np.float64)
     if shape is None:
-        width, height = (int(n) for n in np.maximum(np.floor((high - corner) / resolution + 1e-9) + 1, 0))
+        sizes = np.maximum(np.floor((high - corner) / resolution + 1e-9) + 1, 0)
     else:
-        height, width = shape
-    if width <= 0 or height <= 0 or not np.isfinite(corner).all():
+        sizes = _pair("shape", shape, np.int64)[::-1]
+    if not (sizes > 0).all() or not np.isfinite(corner).all():
         raise TerrainLoopError(
             expected="a grid of at least one pixel that begins below the points' upper corner",
-            found=f"{width} x {height} pixels from {corner.tolist()}; the points end at {high.tolist()}",
+            found=f"{sizes[0]:.0f} x {sizes[1]:.0f} pixels from {corner.tolist()}; the points end at "
+            f"{high.tolist()}",
             mend="change origin or shape, or leave them out",
         )
-    if width * height > MAX_PIXELS:
+    if not float(sizes[0]) * float(sizes[1]) <= MAX_PIXELS:
         raise TerrainLoopError(
             expected=f"a map of at most {MAX_PIXELS / 1e6:.0f} million pixels",
-            found=f"{width} x {height} of {resolution:.3g} m ({21e-9 * width * height:.1f} GB) for "
-            f"{surface.extent_in_words}",
+            found=f"{sizes[0]:.4g} x {sizes[1]:.4g} of {resolution:.3g} m for {data.extent_in_words}",
             mend="remove far outlier points, or make the resolution coarser",
         )
-    return (float(corner[0]), float(corner[1])), (height, width)
+    width, height = (int(size) for size in sizes)
+    return Grid((float(corner[0]), float(corner[1])), resolution, (height, width))
+
+
+def _pair(name: str, value: ArrayLike, dtype: type[np.generic]) -> NDArray[Any]:
+    """Two numbers of a kind."""
+    try:
+        given = np.asarray(value)
+        pair = given.astype(dtype)
+    except (ValueError, TypeError, OverflowError):
+        given = pair = np.empty(0)
+    if pair.shape != (2,) or given.dtype.kind not in ("iu" if dtype is np.int64 else "iuf"):
+        raise TerrainLoopError(
+            expected=f"an {name} of two numbers" if name == "origin" else f"a {name} of two whole numbers",
+            found=f"{value!r:.80}",
+            mend=f"give {'(x, y)' if name == 'origin' else '(rows, columns)'}, or leave it out",
+        )
+    return pair
+
+
+def _check_memory(process: ElevationProcess, grid: Grid, limit: float | None) -> None:
+    """Refuse a map that would not fit into memory, before it is begun."""
+    pixels = grid.shape[0] * grid.shape[1]
+    needed = process.memory_for(pixels) + (BYTES_PER_PIXEL - 20) * pixels
+    check_memory(needed, f"a map of {grid.shape[1]} x {grid.shape[0]} pixels", limit)
 
 
 def _values(parameters: Hyperparameters) -> list[float]:

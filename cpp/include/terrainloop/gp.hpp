@@ -55,8 +55,9 @@ void predict_at(const Points& points, const Hyperparameters& parameters, const d
 /// standard deviations have it raised by the square of the excess, so that flying pixels raise no spikes. The
 /// n points in a square of half that side have it raised by sqrt(n), so that they count as one: the errors of
 /// neighbours are much the same, and do not average out. Where the points are too sparse to tell a scatter,
-/// only the last is left. `ratio` is (count).
-void noise_ratio(const double* xy, const double* elevation, std::size_t count, double cell, double* ratio,
-                 int threads = 1);
+/// only the last is left. A typical scatter below `smallest_scatter` (metres) is taken for that: on quantised
+/// elevations most cells have none. `ratio` is (count).
+void noise_ratio(const double* xy, const double* elevation, std::size_t count, double cell,
+                 double smallest_scatter, double* ratio, int threads = 1);
 
 }  // namespace terrainloop::gp

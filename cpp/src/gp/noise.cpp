@@ -91,8 +91,8 @@ Eigen::ArrayXXd pool(const Eigen::ArrayXXd& variance, const Eigen::ArrayXXd& kno
 
 }  // namespace
 
-void noise_ratio(const double* xy, const double* elevation, std::size_t count, double cell, double* ratio,
-                 int threads) {
+void noise_ratio(const double* xy, const double* elevation, std::size_t count, double cell,
+                 double smallest_scatter, double* ratio, int threads) {
   if (!(cell > 0.0) || count == 0)
     throw std::invalid_argument("there must be points and a positive cell size");
   const CellGrid grid = cells_over(xy, count, cell);
@@ -118,7 +118,7 @@ void noise_ratio(const double* xy, const double* elevation, std::size_t count, d
   for (std::size_t i = 0; i < count; ++i)
     ratio[i] = std::sqrt(patches.first[patches.of_point[i] + 1] - patches.first[patches.of_point[i]]);
   if (told.size() < kEnough * count) return;
-  const double typical = median(told);
+  const double typical = std::max(median(told), smallest_scatter);
   if (!(typical > 0.0)) return;
   for (std::size_t i = 0; i < count; ++i) {
     const double here = deviation(cells.of_point[i]);

@@ -65,7 +65,12 @@ def gp_predict_at(
     """As `gp_predict_grid`, at queries (Q, 2)."""
 
 def gp_noise_ratio(
-    xy: NDArray[np.float64], elevation: NDArray[np.float64], *, cell: float, threads: int = 1
+    xy: NDArray[np.float64],
+    elevation: NDArray[np.float64],
+    *,
+    cell: float,
+    smallest_scatter: float = 0.0,
+    threads: int = 1,
 ) -> NDArray[np.float64]:
     """Noise of each point as a share of the typical one, (N, 1), from the scatter in cells of this side."""
 
