@@ -17,6 +17,7 @@ from terrainloop.gp.exact import check_size, factorise, invert
 from terrainloop.gp.kernel import Array, Hyperparameters, squared_distances
 from terrainloop.gp.surface import Surface, surface_of
 from terrainloop.submap import Submap
+from terrainloop.workers import usable_workers
 
 # How far each hyperparameter may move from its start, as a factor. A length scale far below the
 # spacing of the points would only turn the terrain into noise.
@@ -113,10 +114,11 @@ def fit_hyperparameters(
     Raises
     ------
     TerrainLoopError
-        If there is no cloud, or one that is no submap.
+        If there is no cloud, one that is no submap, or no worker.
     """
     if len(clouds) == 0:
         raise TerrainLoopError(expected="at least one cloud", found="none", mend="pass a list of clouds")
+    workers = usable_workers(workers)
     surfaces = [surface_of(cloud, remove_plane=remove_plane) for cloud in clouds]
     return fit_surfaces(
         surfaces,

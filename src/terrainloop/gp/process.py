@@ -13,6 +13,7 @@ from terrainloop.gp.kernel import Array, Hyperparameters
 from terrainloop.gp.prediction import Prediction
 from terrainloop.gp.surface import Surface, surface_of
 from terrainloop.submap import Submap
+from terrainloop.workers import usable_workers
 
 Solver = Literal["spline", "exact"]
 
@@ -65,6 +66,7 @@ class ElevationProcess:
         workers: int = 1,
     ) -> "ElevationProcess":
         """Settle what is not given; the parameters are those of `GradientMap.from_points`."""
+        workers = usable_workers(workers)
         given_noise = None if noise is None else np.asarray(noise, dtype=np.float64)
         each = given_noise if given_noise is not None and given_noise.ndim else None
         surface = surface_of(points, remove_plane=remove_plane, noise=each).drawn(max_points, seed)
