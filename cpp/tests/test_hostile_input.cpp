@@ -62,7 +62,7 @@ std::vector<Cloud> hostile_clouds() {
     clouds.back().xy.insert(clouds.back().xy.end(), {0.05 * i, 0.0});
     clouds.back().elevation.push_back(0.0);
   }
-  for (const double far : {1e3, 1e5, 1e12, kHuge}) {
+  for (const double far : {1e3, 1e12, kHuge}) {
     clouds.push_back(scattered("a stray point at " + std::to_string(far), 200, 5.0, 1.0));
     clouds.back().xy[7] = far;
   }

@@ -14,11 +14,13 @@ inline void check_threads(int threads) {
   if (threads < 1) throw std::invalid_argument("threads must be >= 1");
 }
 
+/// Coordinates are bounded so that their squares are numbers, too.
 inline void check_positions(const double* xy, const double* elevation, std::size_t count) {
+  const auto bounded = [](double coordinate) { return std::abs(coordinate) < 1e100; };
   if (count == 0) throw std::invalid_argument("there must be at least one point");
   for (std::size_t i = 0; i < count; ++i)
-    if (!std::isfinite(xy[2 * i]) || !std::isfinite(xy[2 * i + 1]) || !std::isfinite(elevation[i]))
-      throw std::invalid_argument("points must be finite");
+    if (!bounded(xy[2 * i]) || !bounded(xy[2 * i + 1]) || !bounded(elevation[i]))
+      throw std::invalid_argument("points must be finite and below 1e100 m");
 }
 
 inline void check_points(const Points& points) {

@@ -20,6 +20,7 @@ constexpr int kRefits = 3;
 constexpr double kPooling = 2.0;   // standard deviation of the weights of neighbouring cells, in cells
 constexpr int kFarthest = 6;       // cells that are pooled, on each side
 constexpr double kSmallest = 0.3;  // of the typical noise: no ground is known much better than the rest
+constexpr double kLargest = 1e50;  // nor anything so badly that it is no number
 constexpr double kOutlier = 3.0;   // standard deviations from which a point counts as an outlier
 
 double median(std::vector<double>& values) {
@@ -152,7 +153,7 @@ void noise_ratio(const double* xy, const double* elevation, std::size_t count, d
     if (here <= 0.0) continue;
     const double smallest = std::max(here, kSmallest * typical);
     const double excess = std::max(1.0, std::abs(scatter.residuals[i]) / (kOutlier * smallest));
-    ratio[i] *= smallest / typical * excess * excess;
+    ratio[i] *= std::min(smallest / typical * excess * excess, kLargest);
   }
 }
 

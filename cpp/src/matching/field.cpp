@@ -5,7 +5,7 @@
 #include <stdexcept>
 #include <utility>
 
-#include "image_checks.hpp"
+#include "../image_checks.hpp"
 #include "interpolate.hpp"
 
 namespace terrainloop {

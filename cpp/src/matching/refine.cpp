@@ -5,7 +5,7 @@
 #include <cmath>
 #include <stdexcept>
 
-#include "image_checks.hpp"
+#include "../image_checks.hpp"
 #include "interpolate.hpp"
 
 namespace terrainloop::refine {
