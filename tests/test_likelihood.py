@@ -171,7 +171,7 @@ def test_a_stray_point_does_no_harm():
 def test_numbers_that_make_no_model_are_refused(surface):
     with pytest.raises(ValueError, match="positive"):
         blocks_of(surface, side=-1.0)
-    with pytest.raises(ValueError, match="noise positive"):
+    with pytest.raises(ValueError, match="noise must be positive"):
         blocks_of(TrainingData(surface.xy, surface.elevation, np.zeros(3), np.zeros(2), np.zeros(400)))
 
 

@@ -1,9 +1,9 @@
 """What the machine can spare: memory and processors."""
 
+import operator
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from numbers import Integral
 from pathlib import Path
 
 from terrainloop.errors import TerrainLoopError
@@ -31,19 +31,32 @@ def available_memory() -> float:
     return max(0.0, min(_free_memory(), _left_in_cgroup(), _left_of_address_space()))
 
 
-def check_workers(workers: int) -> int:
-    """The number of threads to start: `workers`, but no more than the machine has processors.
+def available_processors() -> int:
+    """Number of processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def usable_workers(workers: int) -> int:
+    """The number of workers to start: `workers`, but no more than there are processors.
 
     Raises
     ------
     TerrainLoopError
         If it is not a whole number of at least one.
     """
-    if isinstance(workers, bool) or not isinstance(workers, Integral) or workers < 1:
+    try:
+        number = operator.index(workers)
+    except TypeError:
+        number = 0
+    if number < 1 or isinstance(workers, bool):
         raise TerrainLoopError(
-            expected="a number of workers of at least 1", found=repr(workers), mend="leave it out for one"
+            expected="a number of workers of at least 1",
+            found=repr(workers)[:40],
+            mend="leave it out for one",
         )
-    return min(int(workers), os.cpu_count() or 1)
+    return min(number, available_processors())
 
 
 @contextmanager

@@ -19,7 +19,7 @@ double roughness(const RowMatrix& w) {
 }
 
 RowMatrix precondition(const std::vector<Subdomain>& subdomains, const RowMatrix& residual,
-                       Workers& workers) {
+                       ThreadPool& workers) {
   std::vector<RowMatrix> parts(subdomains.size());
   workers.run(static_cast<int>(parts.size()), [&](int i) { parts[i] = subdomains[i].solve(residual); });
   RowMatrix sum = RowMatrix::Zero(residual.rows(), residual.cols());
@@ -30,7 +30,7 @@ RowMatrix precondition(const std::vector<Subdomain>& subdomains, const RowMatrix
 }
 
 RowMatrix product(const Information& information, const Precision& precision, const RowMatrix& w,
-                  Workers& workers) {
+                  ThreadPool& workers) {
   RowMatrix out = precision.rows * w * precision.cols / precision.variance;
   information.add_product(w, out, workers);
   return out;
@@ -41,7 +41,7 @@ double dot(const RowMatrix& a, const RowMatrix& b) { return a.cwiseProduct(b).su
 }  // namespace
 
 RowMatrix solve_weights(const Information& information, const Precision& precision,
-                        const std::vector<Subdomain>& subdomains, Workers& workers) {
+                        const std::vector<Subdomain>& subdomains, ThreadPool& workers) {
   RowMatrix residual = information.vector();
   RowMatrix w = RowMatrix::Zero(residual.rows(), residual.cols());
   if (residual.isZero(0.0)) return w;

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 _Array = NDArray[np.float64]
 
 VARIANT: str
-"""Which build of the core this is: native, portable, x86-64-v2, x86-64-v3 or x86-64-v4."""
+"""Which build of the core this is: native, portable, x86-64-v2 or x86-64-v3."""
 
 LEVEL: int
 """Level of x86-64 that its compiler made use of; 0 for less than 2, or another architecture."""

@@ -17,7 +17,7 @@ from terrainloop.gp.checks import check_max_points, check_positive, check_seed, 
 from terrainloop.gp.exact import check_size, factorise, invert
 from terrainloop.gp.kernel import Array, Hyperparameters, squared_distances
 from terrainloop.gp.training import OCCUPANCY_CELLS, PATCH_SIDE, TrainingData, detrend
-from terrainloop.resources import check_workers
+from terrainloop.resources import usable_workers
 from terrainloop.submap import MIN_POINTS, Submap
 
 # How far each hyperparameter may move from its start, as a factor. A length scale far below the
@@ -87,7 +87,7 @@ class FitOptions:
     workers: int = 1
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "workers", check_workers(self.workers))
+        object.__setattr__(self, "workers", usable_workers(self.workers))
         check_seed(self.seed)
 
 

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <algorithm>
 #include <atomic>
 #include <condition_variable>
 #include <exception>
@@ -11,12 +12,15 @@
 namespace terrainloop::gp {
 
 /// Threads that share loops. What a loop computes must not depend on which thread takes which index.
-class Workers {
+///
+/// Threads are started when a loop first has work for them. Where the system refuses one, the loop runs on
+/// those there are, and at least on the caller's.
+class ThreadPool {
  public:
-  explicit Workers(int threads) {
-    for (int i = 1; i < threads; ++i) threads_.emplace_back([this] { serve(); });
-  }
-  ~Workers() {
+  /// At most `threads` in all, the caller's among them, and no more than the machine runs at once.
+  explicit ThreadPool(int threads) : limit_(std::min(threads, most())) {}
+
+  ~ThreadPool() {
     {
       const std::lock_guard<std::mutex> lock(mutex_);
       stopping_ = true;
@@ -24,11 +28,13 @@ class Workers {
     wake_.notify_all();
     for (std::thread& thread : threads_) thread.join();
   }
-  Workers(const Workers&) = delete;
-  Workers& operator=(const Workers&) = delete;
+  ThreadPool(const ThreadPool&) = delete;
+  ThreadPool& operator=(const ThreadPool&) = delete;
 
-  /// Calls body(0) ... body(count - 1), in any order; rethrows the first exception.
+  /// Calls body(0) ... body(count - 1), in any order; rethrows the first exception. Calls take turns.
   void run(int count, const std::function<void(int)>& body) {
+    const std::lock_guard<std::mutex> turn(running_);
+    start_threads(count);
     {
       const std::lock_guard<std::mutex> lock(mutex_);
       body_ = &body;
@@ -46,6 +52,19 @@ class Workers {
   }
 
  private:
+  /// More threads than processors only cost memory. A few are allowed everywhere, so that a test of
+  /// concurrency is one on any machine.
+  static int most() { return std::max(4, static_cast<int>(std::thread::hardware_concurrency())); }
+
+  void start_threads(int count) {
+    try {
+      while (static_cast<int>(threads_.size()) + 1 < std::min(limit_, count))
+        threads_.emplace_back([this, seen = loop_] { serve(seen); });
+    } catch (const std::exception&) {  // std::system_error or std::bad_alloc: do not ask again
+      limit_ = static_cast<int>(threads_.size()) + 1;
+    }
+  }
+
   void take(const std::function<void(int)>& body, int count) {
     try {
       for (int i = next_++; i < count; i = next_++) body(i);
@@ -56,8 +75,7 @@ class Workers {
     }
   }
 
-  void serve() {
-    long seen = 0;
+  void serve(long seen) {
     std::unique_lock<std::mutex> lock(mutex_);
     while (true) {
       wake_.wait(lock, [&] { return stopping_ || loop_ != seen; });
@@ -72,8 +90,9 @@ class Workers {
     }
   }
 
+  int limit_;
   std::vector<std::thread> threads_;
-  std::mutex mutex_;
+  std::mutex running_, mutex_;
   std::condition_variable wake_, done_;
   const std::function<void(int)>* body_ = nullptr;
   std::exception_ptr error_;
