@@ -30,7 +30,7 @@ from reproduce.results import Result, best_of_each
 from reproduce.runner import ROOT, run_all, tasks_of, versions
 from reproduce.visual import frames_of
 from terrainloop.errors import TerrainLoopError
-from terrainloop.io.results import write_whole
+from terrainloop.io.files import write_whole_text
 
 STAND_INS = (
     "The paper's datasets are not public: Etna1-4 and Morocco here are simulated stand-ins "
@@ -133,7 +133,7 @@ def record_run(args: argparse.Namespace, out: Path, drives: Sequence[Drive]) -> 
         "workers": args.workers,
         "threads_per_task": 1,
     }
-    write_whole(out / "settings.json", lambda file: json.dump(record, file, indent=2))
+    write_whole_text(out / "settings.json", lambda file: json.dump(record, file, indent=2))
 
 
 def machine() -> dict[str, str | int | None]:

@@ -17,7 +17,7 @@ from reproduce.visual import ALIKE, Frames
 from terrainloop.evaluation.judge import JudgedPair
 from terrainloop.evaluation.precision_recall import OperatingPoint, precision_recall
 from terrainloop.geometry import transform
-from terrainloop.io.results import write_whole
+from terrainloop.io.files import write_whole_text
 from terrainloop.report.figures import SOURCE_COLOUR, TARGET_COLOUR, save_figure
 
 INLIER_THRESHOLDS = tuple(range(1, 21))  # the paper's
@@ -47,7 +47,7 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         writer.writeheader()
         writer.writerows(rows)
 
-    write_whole(path, write)
+    write_whole_text(path, write)
 
 
 def trajectories(drives: Sequence[Drive]) -> Plate:

@@ -31,7 +31,8 @@ from terrainloop import __version__
 from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.baselines.method import Match, Method, Scale
 from terrainloop.geometry import parameters_of, se3
-from terrainloop.io.results import POSE_COLUMNS, write_whole
+from terrainloop.io.files import write_whole_text
+from terrainloop.io.results import POSE_COLUMNS
 
 ROOT = Path(__file__).parent.parent
 PROCESSORS = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
@@ -192,7 +193,7 @@ def execute(task: Task) -> None:
         "pair_wall_ms": pairing.median("wall"),
         "megabytes": megabytes(kept),
     }
-    write_whole(task.csv, lambda file: _write_pairs(file, scored))
+    write_whole_text(task.csv, lambda file: _write_pairs(file, scored))
     record = {
         "mission": task.drive.name,
         "method": method.name,
@@ -202,7 +203,7 @@ def execute(task: Task) -> None:
         **spent,
         "versions": versions(),
     }
-    write_whole(task.json, lambda file: json.dump(record, file, indent=2))
+    write_whole_text(task.json, lambda file: json.dump(record, file, indent=2))
 
 
 class Stopwatch:

@@ -9,7 +9,7 @@ import numpy as np
 from reproduce.figures import write_rows
 from reproduce.results import GROUNDS, READINGS, Result, best_of_each
 from terrainloop.evaluation.precision_recall import Metrics
-from terrainloop.io.results import write_whole
+from terrainloop.io.files import write_whole_text
 
 Rows = list[dict[str, Any]]
 
@@ -98,7 +98,7 @@ def times(by_mission: Mapping[str, Sequence[Result]]) -> Rows:
 
 def save(folder: Path, stem: str, rows: Rows, text: str) -> None:
     write_rows(folder / f"{stem}.csv", rows)
-    write_whole(folder / f"{stem}.md", lambda file: file.write(text))
+    write_whole_text(folder / f"{stem}.md", lambda file: file.write(text))
 
 
 def markdown_of_table(rows: Rows, notes: Sequence[str]) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from reproduce.missions import FRAMES_FILE, Drive
 from terrainloop.evaluation.baselines.ibow import closures, features_of
 from terrainloop.geometry import yaw_of
-from terrainloop.io.results import write_whole
+from terrainloop.io.files import write_whole_text
 
 SKIPPED = 14  # images just before one: two submaps of 7 m, as pairs of neighbours are left out
 NEAR = 2.0  # metres between two cameras that are at the same place
@@ -83,4 +83,4 @@ def _write(drive: Drive, file: Path, skipped: int) -> None:
     features = [features_of(image) for name in drive.mission.names for image in drive.images(name)]
     said = closures(features, skipped)
     lines = ["image,closed,inliers", *(f"{i},{one.image},{one.inliers}" for i, one in enumerate(said))]
-    write_whole(file, lambda output: output.write("\n".join(lines) + "\n"))
+    write_whole_text(file, lambda output: output.write("\n".join(lines) + "\n"))

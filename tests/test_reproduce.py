@@ -173,7 +173,7 @@ def test_missing_package_is_told_in_a_line_and_left_out(drive, tmp_path, capsys)
 
 
 def test_half_a_file_is_never_left(tmp_path):
-    from reproduce.runner import write_whole
+    from terrainloop.io.files import write_whole_text
 
     path = tmp_path / "a.csv"
     path.write_text("old")
@@ -183,7 +183,7 @@ def test_half_a_file_is_never_left(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_whole(path, fail)
+        write_whole_text(path, fail)
     assert path.read_text() == "old"
 
 

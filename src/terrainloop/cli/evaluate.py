@@ -29,6 +29,13 @@ _COUNTS = ("precision", "recall", "true_positives", "false_positives", "false_ne
 TRUTHS = {"box": "Bounding-box IoU", "observed": "IoU of the observed ground"}
 
 
+HELP = """Hold a run's pairs against true poses: precision and recall over the score or the inlier
+threshold.
+
+Consecutive submaps are left out: odometry joins them anyway. Detect with --all-pairs to score
+every other pair."""
+
+
 def command(
     run: Annotated[Path, typer.Argument(help="Output folder of 'terrainloop detect'.")],
     truth: Annotated[Path, typer.Option("--truth", help="True poses, TUM or KITTI, one line a cloud.")],
@@ -53,11 +60,7 @@ def command(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Hold a run's pairs against true poses: precision and recall over the score or the inlier threshold.
-
-    Consecutive submaps are left out: odometry joins them anyway. Detect with --all-pairs to score
-    every other pair.
-    """
+    """Run ``terrainloop evaluate``."""
     from terrainloop.config import Settings
     from terrainloop.evaluation.judge import judge, readings
     from terrainloop.evaluation.precision_recall import precision_recall

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from terrainloop.loop import LoopCandidate
 
 
+HELP = "Match cloud A against cloud B: a loop closure or not, and the transform from A to B."
+
+
 def command(
     source: Annotated[Path, typer.Argument(help="Cloud A, metres, gravity-aligned.")],
     target: Annotated[Path, typer.Argument(help="Cloud B, metres, gravity-aligned.")],
@@ -39,7 +42,7 @@ def command(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Match cloud A against cloud B: a loop closure or not, and the transform from A to B."""
+    """Run ``terrainloop match``."""
     from terrainloop.detection.detector import map_pair
     from terrainloop.io.clouds import read_cloud
     from terrainloop.io.results import loop_to_dict
@@ -67,7 +70,7 @@ def _show(console: Console, candidate: "LoopCandidate") -> None:
     from terrainloop.geometry import parameters_of
 
     verdict = "loop closure" if candidate else "no loop closure"
-    console.print(f"{candidate.source} to {candidate.target}: {verdict}: {candidate.reason}", markup=False)
+    console.print(f"{candidate.source} to {candidate.target}: {verdict}: {candidate.reason}")
     if not candidate:
         return
     values, spread = parameters_of(candidate.T_target_source), np.sqrt(np.diag(candidate.covariance))
@@ -80,6 +83,5 @@ def _show(console: Console, candidate: "LoopCandidate") -> None:
     if candidate.source_origin.any() or candidate.target_origin.any():
         console.print("  the +/- are those about points near the clouds: their frames' origins are far away")
     console.print(
-        f"  overlap {candidate.overlap:.0%}; takes points of {candidate.source} into {candidate.target}",
-        markup=False,
+        f"  overlap {candidate.overlap:.0%}; takes points of {candidate.source} into {candidate.target}"
     )

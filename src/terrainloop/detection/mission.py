@@ -1,9 +1,9 @@
 """A whole mission at once: maps in parallel processes, then every pair."""
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Generator
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from terrainloop.config import Settings
 from terrainloop.detection.detector import LoopDetector, PairSink, fit_database, map_submap
-from terrainloop.detection.run import Run, RunWriter
+from terrainloop.detection.run import Run, RunWriter, Tally
 from terrainloop.detection.workers import map_in_processes
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
@@ -20,6 +20,7 @@ from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.io.missions import Mission, load_mission
 from terrainloop.loop import LoopCandidate
 from terrainloop.record import SubmapRecord
+from terrainloop.resources import check_workers
 from terrainloop.submap import Submap
 
 logger = logging.getLogger(__name__)
@@ -36,6 +37,21 @@ class MappedCloud:
     record: SubmapRecord
     entry: MapEntry | None
 
+    def __str__(self) -> str:
+        record = self.record
+        if self.entry is None:
+            return f"{record.name}: left out: {record.notes}"
+        gradient_map = self.entry.gradient_map
+        p, (rows, columns) = gradient_map.parameters, gradient_map.mask.shape
+        facts = [
+            f"{record.points} points",
+            f"{columns} x {rows} pixels of {gradient_map.resolution:.3g} m",
+            f"{gradient_map.mask.mean():.0%} observed",
+            f"{len(self.entry.features)} keypoints",
+            f"length scale {p.length_scale:.3g} m, noise {p.noise:.2g} m",
+        ]
+        return f"{record.name}: {', '.join(facts)}" + (f"; {record.notes}" if record.notes else "")
+
 
 def detect_mission(
     mission: Mission | Path | str,
@@ -49,7 +65,7 @@ def detect_mission(
     """Find the loop closures of a mission, leaving out clouds that are broken.
 
     An interrupt (Ctrl-C) ends the comparison of pairs early; what was found by then is returned and written,
-    with ``run.complete`` false.
+    with ``run.complete`` false. Before the first pair, and whatever else is raised, nothing is written.
 
     Parameters
     ----------
@@ -61,7 +77,8 @@ def detect_mission(
     on_pair : callable
         Called with every LoopCandidate as it is decided, rejected ones too.
     workers : int
-        Processes for the maps, threads for the pairs; the result does not depend on their number.
+        Processes for the maps, threads for the pairs, no more than there are processors; the result does
+        not depend on their number.
     on_progress : callable
         Called with (stage, done, total) as the work goes on.
 
@@ -73,13 +90,15 @@ def detect_mission(
     Raises
     ------
     TerrainLoopError
-        If no cloud can be used, or the output cannot be written.
+        If no cloud can be used.
+    OSError
+        If the output cannot be written; it names the folder.
     """
-    settings = settings or Settings()
+    settings, workers = settings or Settings(), check_workers(workers)
     mission = mission if isinstance(mission, Mission) else load_mission(mission)
     if output is None:
         return _detect(mission, settings, on_pair, workers, on_progress)
-    with RunWriter(Path(output)) as writer:
+    with RunWriter.open(Path(output)) as writer:
 
         def keep(candidate: LoopCandidate) -> None:
             writer.add(candidate)
@@ -93,9 +112,11 @@ def _detect(
 ) -> Run:
     parameters = _fit_mission(mission, settings, workers) if settings.map.fit == "database" else None
     clouds: list[MappedCloud] = []
-    for cloud in _map_clouds(mission, settings, parameters, workers):
-        clouds.append(cloud)
-        on_progress("maps", len(clouds), len(mission))
+    with closing(_map_clouds(mission, settings, parameters, workers)) as mapped:
+        for cloud in mapped:
+            clouds.append(cloud)
+            logger.info("%s", cloud)
+            on_progress("maps", len(clouds), len(mission))
     entries = [cloud.entry for cloud in clouds if cloud.entry is not None]
     if not entries:
         raise TerrainLoopError(
@@ -103,35 +124,45 @@ def _detect(
             found=f"{len(clouds)} broken, the first: {clouds[0].record.notes}",
             mend="correct the clouds or name another folder",
         )
-    compared = max(0, len(entries) - settings.skip_recent)
-    detector = LoopDetector(
-        settings,
-        parameters=parameters,
-        expected_pairs=compared * (compared - 1) // 2,
-        on_pair=on_pair,
-        workers=workers,
-    )
-    complete = True
-    try:
-        with threadpool_limits(1, user_api="blas"):
-            for done, entry in enumerate(entries, start=1):
-                detector.add_entry(entry)
-                on_progress("pairs", done, len(entries))
-    except KeyboardInterrupt:
-        logger.warning(
-            "interrupted after %d of %d submaps: only the pairs compared by then are in the result",
-            len(detector.entries),
-            len(entries),
-        )
-        complete = False
-    return Run(
+    run = Run(
         settings=settings,
         parameters=parameters,
         submaps=tuple(cloud.record for cloud in clouds),
-        loops=tuple(detector.loops),
-        entries=detector.entries,
-        complete=complete,
+        loops=(),
+        entries={entry.id: entry for entry in entries},
     )
+    return _compare(run, on_pair, workers, on_progress)
+
+
+def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -> Run:
+    """The run with its loops, after every submap was compared with the earlier ones."""
+    tally = Tally()
+
+    def count(candidate: LoopCandidate) -> None:
+        tally.add(candidate)
+        on_pair(candidate)
+
+    compared = max(0, len(run.entries) - run.settings.skip_recent)
+    detector = LoopDetector(
+        run.settings,
+        parameters=run.parameters,
+        expected_pairs=compared * (compared - 1) // 2,
+        on_pair=count,
+        workers=workers,
+    )
+    try:
+        with threadpool_limits(1, user_api="blas"):
+            for done, entry in enumerate(run.entries.values(), start=1):
+                detector.add_entry(entry)
+                on_progress("pairs", done, len(run.entries))
+    except KeyboardInterrupt:
+        logger.warning(
+            "interrupted after %d of %d submaps: the result holds only the pairs compared by then",
+            len(detector.entries),
+            len(run.entries),
+        )
+        run = replace(run, complete=False)
+    return tally.of(run)
 
 
 def _fit_mission(mission: Mission, settings: Settings, workers: int) -> Hyperparameters | None:
@@ -157,7 +188,7 @@ def _fit_mission(mission: Mission, settings: Settings, workers: int) -> Hyperpar
 
 def _map_clouds(
     mission: Mission, settings: Settings, parameters: Hyperparameters | None, workers: int
-) -> Iterator[MappedCloud]:
+) -> Generator[MappedCloud, None, None]:
     """Every cloud of the mission in order, mapped in as many processes as there are workers."""
     task = partial(_map_cloud, mission, settings, parameters)
     return map_in_processes(task, len(mission), workers, partial(_killed, mission))
@@ -177,7 +208,7 @@ def _map_cloud(
     except MemoryError:
         return _broken(mission, index, "not enough memory for its map: use fewer workers, or cut the cloud")
     except Exception as error:  # not even a fault of ours may end a mission of hours
-        return _broken(mission, index, f"a fault of terrainloop, please report it: {error!r}")
+        return _broken(mission, index, f"a fault of terrainloop, please report it: {error!r:.300}")
 
 
 def _killed(mission: Mission, index: int) -> MappedCloud:

@@ -17,6 +17,7 @@ from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.precision_recall import OperatingPoint
 from terrainloop.geometry import Array, se2, transform, yaw_of
 from terrainloop.gradient_map import GradientMap
+from terrainloop.io.files import write_whole
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.correspondences import Associations, associate
 from terrainloop.matching.overlay import Overlay
@@ -167,10 +168,10 @@ def figure_precision_recall(
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a PNG; the same figure gives the same bytes."""
+    """Write a PNG, whole or not at all; the same figure gives the same bytes."""
     if path.suffix.lower() != ".png":
         raise TerrainLoopError(expected="a picture that ends in .png", found=str(path), mend="rename it")
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    write_whole(path, lambda file: figure.savefig(file, format="png", dpi=110, metadata={"Software": None}))
 
 
 def _steepest(gradient_map: GradientMap) -> float:

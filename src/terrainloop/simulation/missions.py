@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import se3, transform
 from terrainloop.io.clouds import write_cloud
+from terrainloop.io.files import write_whole_text
+from terrainloop.io.staging import errors_naming, publish, staging
 from terrainloop.io.trajectories import Trajectory, write_tum
 from terrainloop.simulation.odometry import Drift, estimate, true_poses
 from terrainloop.simulation.paths import revisiting_path
@@ -20,6 +22,8 @@ from terrainloop.simulation.sensors import SpinningLidar, StereoCamera
 from terrainloop.simulation.terrain import Terrain, make_terrain
 
 Array = NDArray[np.float64]
+
+_DESCRIPTION = "simulation.yaml"
 
 
 @dataclass(frozen=True)
@@ -229,16 +233,53 @@ def thin(points: Array, voxel: float) -> Array:
 def write_mission(mission: SimulatedMission, path: FilePath | str) -> None:
     """Write a mission folder: ``clouds/*.ply``, ``odometry.tum``, ``truth.tum``, ``simulation.yaml``.
 
-    The first column of the trajectories is the index of the submap.
+    All of it is written or nothing; an earlier simulation in the folder is replaced. The first column of
+    the trajectories is the index of the submap.
+
+    Raises
+    ------
+    TerrainLoopError
+        If there are clouds in the folder that were not simulated.
+    OSError
+        Naming the folder, where it cannot be written.
     """
     folder = FilePath(path)
-    (folder / "clouds").mkdir(parents=True, exist_ok=True)
-    for i, cloud in enumerate(mission.clouds):
-        write_cloud(folder / "clouds" / f"{i:06d}.ply", cloud)
+    check_mission_folder(folder)
+    clouds = [f"clouds/{i:06d}.ply" for i in range(len(mission.clouds))]
     stamps = np.arange(len(mission.clouds), dtype=float)
-    write_tum(folder / "odometry.tum", Trajectory(stamps, mission.odometry))
-    write_tum(folder / "truth.tum", Trajectory(stamps, mission.truth))
-    (folder / "simulation.yaml").write_text(yaml.safe_dump(_description(mission), sort_keys=False))
+    with staging(folder) as aside, errors_naming(folder):
+        (aside / "clouds").mkdir()
+        for name, cloud in zip(clouds, mission.clouds, strict=True):
+            write_cloud(aside / name, cloud)
+        write_tum(aside / "odometry.tum", Trajectory(stamps, mission.odometry))
+        write_tum(aside / "truth.tum", Trajectory(stamps, mission.truth))
+        description = yaml.safe_dump(_description(mission), sort_keys=False)
+        write_whole_text(aside / _DESCRIPTION, lambda file: file.write(description))
+        names = [*clouds, "odometry.tum", "truth.tum", _DESCRIPTION]
+        publish(aside, folder, names, stale=[*_simulated_clouds(folder), *names])
+
+
+def check_mission_folder(path: FilePath | str) -> None:
+    """Refuse a folder with clouds that `write_mission` would mix with its own.
+
+    Raises
+    ------
+    TerrainLoopError
+        If there are clouds in it, but no description of the simulation that made them.
+    """
+    folder = FilePath(path)
+    own = _simulated_clouds(folder) if (folder / _DESCRIPTION).exists() else []
+    others = sorted({f"clouds/{file.name}" for file in (folder / "clouds").glob("*")} - set(own))
+    if others:
+        raise TerrainLoopError(
+            expected="a new folder, or one of an earlier simulation",
+            found=f"{others[0]} in {folder}, which was not simulated",
+            mend="give another folder",
+        )
+
+
+def _simulated_clouds(folder: FilePath) -> list[str]:
+    return [f"clouds/{file.name}" for file in (folder / "clouds").glob("[0-9]" * 6 + ".ply")]
 
 
 def _description(mission: SimulatedMission) -> dict[str, object]:
