@@ -119,6 +119,14 @@ def small_disk(tmp_path):
     subprocess.run(["umount", disk], check=True)
 
 
+def error_of(action):
+    try:
+        action()
+    except OSError as error:
+        return error
+    return None
+
+
 def test_a_disk_that_is_really_full(small_disk):
     """Ever more room, page by page, until the run fits beside the earlier one."""
     page, folder = os.sysconf("SC_PAGE_SIZE"), small_disk / "out"
@@ -128,16 +136,13 @@ def test_a_disk_that_is_really_full(small_disk):
         filler = small_disk / "filler"
         free = os.statvfs(small_disk).f_bavail
         filler.write_bytes(bytes(max(0, free - room) * page))
-        try:
-            write(folder, 1, 40)
-        except OSError as error:
-            failures += 1
-            assert error.errno == errno.ENOSPC
-            assert error.filename == str(folder)
-            assert content(folder) == before
-            filler.unlink()
-        else:
+        error = error_of(lambda: write(folder, 1, 40))
+        if error is None:
             break
+        failures += 1
+        assert (error.errno, error.filename) == (errno.ENOSPC, str(folder))
+        assert content(folder) == before
+        filler.unlink()
     assert failures > 3
     assert len(Run.read(folder).loops) == 1
     assert set(content(folder)) == set(OF_A_RUN)

@@ -1,4 +1,4 @@
-"""Tasks shared among processes: whatever dies, each result comes once and in order, and nothing stays behind."""
+"""Tasks shared among processes: whatever dies, each result comes once and in order, and no process stays."""
 
 import os
 import signal
@@ -120,9 +120,7 @@ def test_a_script_without_a_guard_gets_an_error_instead_of_broken_results(tmp_pa
         "from terrainloop.detection.workers import map_in_processes\n"
         "print(list(map_in_processes(str, 4, 2, repr)))\n"
     )
-    done = subprocess.run(
-        [sys.executable, script], capture_output=True, text=True, check=False, timeout=60
-    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 1
     assert "__main__" in done.stderr.splitlines()[-1]
     assert done.stdout == ""
@@ -143,14 +141,18 @@ if __name__ == "__main__":
 
 def marked_processes(mark):
     """Ids of all live processes whose environment holds the mark."""
-    found = []
-    for environ in Path("/proc").glob("[0-9]*/environ"):
-        try:
-            if mark.encode() in environ.read_bytes() and is_running(environ.parent.name):
-                found.append(int(environ.parent.name))
-        except OSError:
-            continue
-    return found
+    return [
+        int(environ.parent.name)
+        for environ in Path("/proc").glob("[0-9]*/environ")
+        if mark.encode() in content_of(environ) and is_running(environ.parent.name)
+    ]
+
+
+def content_of(path):
+    try:
+        return path.read_bytes()
+    except OSError:  # it has ended, or is another user's
+        return b""
 
 
 def wait_until(holds, seconds=60.0):
@@ -181,14 +183,15 @@ def test_workers_end_with_their_parent_however_that_ends(tmp_path, number, to_gr
         stderr=subprocess.PIPE,
         text=True,
     )
-    try:
-        wait_until(lambda: (tmp_path / "0").exists() and (tmp_path / "1").exists())
-        assert len(marked_processes(mark)) >= 3
-        (os.killpg if to_group else os.kill)(parent.pid, number)
-        _, err = parent.communicate(timeout=30)
-        wait_until(lambda: not marked_processes(mark), 10)
-    finally:
-        parent.kill()
+    with parent:
+        try:
+            wait_until(lambda: (tmp_path / "0").exists() and (tmp_path / "1").exists())
+            assert len(marked_processes(mark)) >= 3
+            (os.killpg if to_group else os.kill)(parent.pid, number)
+            _, err = parent.communicate(timeout=30)
+            wait_until(lambda: not marked_processes(mark), 10)
+        finally:
+            parent.kill()
     assert parent.returncode == -number
     # The script is no command: Python shows where it was interrupted, once, and the workers are silent.
     assert err.count("Traceback") == (number == signal.SIGINT)

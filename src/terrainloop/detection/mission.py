@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Generator
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -110,13 +110,14 @@ def detect_mission(
 def _detect(
     mission: Mission, settings: Settings, on_pair: PairSink, workers: int, on_progress: Progress
 ) -> Run:
-    parameters = _fit_mission(mission, settings, workers) if settings.map.fit == "database" else None
     clouds: list[MappedCloud] = []
-    with closing(_map_clouds(mission, settings, parameters, workers)) as mapped:
-        for cloud in mapped:
-            clouds.append(cloud)
-            logger.info("%s", cloud)
-            on_progress("maps", len(clouds), len(mission))
+    with _repairs_not_logged():
+        parameters = _fit_mission(mission, settings, workers) if settings.map.fit == "database" else None
+        with closing(_map_clouds(mission, settings, parameters, workers)) as mapped:
+            for cloud in mapped:
+                clouds.append(cloud)
+                logger.info("%s", cloud)
+                on_progress("maps", len(clouds), len(mission))
     entries = [cloud.entry for cloud in clouds if cloud.entry is not None]
     if not entries:
         raise TerrainLoopError(
@@ -163,6 +164,21 @@ def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -
         )
         run = replace(run, complete=False)
     return tally.of(run)
+
+
+@contextmanager
+def _repairs_not_logged() -> Generator[None, None, None]:
+    """They are in the records: logged, they would depend on which process read the cloud, and how often."""
+
+    def never(record: logging.LogRecord) -> bool:
+        return False
+
+    of_submaps = logging.getLogger(Submap.__module__)
+    of_submaps.addFilter(never)
+    try:
+        yield
+    finally:
+        of_submaps.removeFilter(never)
 
 
 def _fit_mission(mission: Mission, settings: Settings, workers: int) -> Hyperparameters | None:

@@ -69,7 +69,9 @@ def figure_match(source: MapEntry, target: MapEntry, candidate: LoopCandidate, s
     inliers = get_inliers(associations, T[None], inlier_radius_of(settings, target_map))[0]
     figure = Figure(figsize=(13, 11), layout="constrained")
     verdict = "loop closure" if candidate else "no loop closure"
-    figure.suptitle(f"{candidate.source} to {candidate.target}: {verdict} ({candidate.reason})", parse_math=False)
+    figure.suptitle(
+        f"{candidate.source} to {candidate.target}: {verdict} ({candidate.reason})", parse_math=False
+    )
     grid = figure.add_gridspec(2, 2)
     left, right = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
     for axes, gradient_map, role, name in (
