@@ -20,6 +20,7 @@ from terrainloop.detection.mission import detect_mission
 from terrainloop.detection.run import DERIVED, OF_A_RUN, Run, RunWriter
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.kernel import Hyperparameters
+from terrainloop.io.missions import Mission
 from terrainloop.loop import LoopCandidate
 from terrainloop.record import SubmapRecord
 
@@ -289,6 +290,22 @@ def test_an_interrupt_while_a_query_is_compared_keeps_the_ones_before(
 
 def test_pairs_are_counted_without_an_output_too(mission_folder, thin):
     assert detect_mission(mission_folder, thin).num_pairs == 6
+
+
+@pytest.mark.parametrize("odd", [b"\xff\xfe", b"new\nline", b"\x1b[31m"])
+def test_a_name_that_is_no_text_costs_its_own_cloud(mission_folder, thin, tmp_path, odd):
+    cloud = mission_folder / "clouds" / "000000.ply"
+    name = os.fsdecode(odd + b".ply")
+    try:
+        (tmp_path / name).symlink_to(cloud)
+    except OSError:
+        pytest.skip("the file system takes text only")
+    mission = Mission(tmp_path, (cloud, tmp_path / name, cloud.with_name("000001.ply")))
+    run = detect_mission(mission, thin, output=tmp_path / "out")
+    assert [record.status for record in run.submaps] == ["ok", "broken", "ok"]
+    assert run.submaps[1].name.isprintable()
+    read = Run.read(tmp_path / "out")
+    assert [record.name for record in read.submaps] == [record.name for record in run.submaps]
 
 
 @pytest.mark.parametrize("workers", [0, -1, 1.5, "2", True])

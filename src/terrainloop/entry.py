@@ -60,6 +60,20 @@ class MapEntry:
         """Unique among all sessions: ``session/name``, or the name where there is one session only."""
         return f"{self.record.session}/{self.name}" if self.record.session else self.name
 
+    @property
+    def summary(self) -> str:
+        """What was mapped, with which hyperparameters, and what was repaired, in one line."""
+        p, (rows, columns) = self.gradient_map.parameters, self.gradient_map.mask.shape
+        facts = [
+            f"{self.record.points} points",
+            f"{columns} x {rows} pixels of {self.gradient_map.resolution:.3g} m",
+            f"{self.gradient_map.mask.mean():.0%} observed",
+            f"{len(self.features)} keypoints",
+            f"length scale {p.length_scale:.3g} m, relief {p.variance**0.5:.3g} m, noise {p.noise:.2g} m",
+        ]
+        repairs = f"; {self.record.notes}" if self.record.notes else ""
+        return f"{self.name}: {', '.join(facts)}{repairs}"
+
     def field_at(self, spacing: float, settings: Settings) -> Field:
         """The field at `spacing` metres per pixel; the stored one where that is its spacing."""
         if spacing == self.field.spacing:

@@ -1,5 +1,6 @@
 """``terrainloop match``: two clouds, loop or not."""
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,6 +25,8 @@ from terrainloop.cli.terminal import (
 
 if TYPE_CHECKING:
     from terrainloop.loop import LoopCandidate
+
+logger = logging.getLogger(__name__)
 
 
 HELP = "Match cloud A against cloud B: a loop closure or not, and the transform from A to B."
@@ -56,6 +59,8 @@ def command(
     with terminal.progress() as progress:
         progress("match", 0, 2)
         entries = map_pair(*submaps, settings, workers=worker_count(workers))
+        for entry in entries:
+            logger.info("%s", entry.summary)
         progress("match", 1, 2)
         candidate = compare(*entries, settings)
         progress("match", 2, 2)

@@ -156,7 +156,9 @@ def check_output(path: Path, suffixes: Sequence[str]) -> None:
         raise TerrainLoopError(
             expected=f"a folder for {path.name}", found=f"no folder {path.parent}", mend="make it first"
         )
-    _check_writable(path if path.exists() else path.parent)
+    _check_writable(path.parent)
+    if path.exists():
+        _check_writable(path)
 
 
 def check_folder(folder: Path) -> None:

@@ -15,7 +15,7 @@ from terrainloop.detection.detector import LoopDetector, PairSink, fit_database,
 from terrainloop.detection.run import Run, RunWriter, Tally
 from terrainloop.detection.workers import map_in_processes
 from terrainloop.entry import MapEntry
-from terrainloop.errors import TerrainLoopError
+from terrainloop.errors import TerrainLoopError, printable
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.io.missions import Mission, load_mission
 from terrainloop.loop import LoopCandidate
@@ -38,19 +38,9 @@ class MappedCloud:
     entry: MapEntry | None
 
     def __str__(self) -> str:
-        record = self.record
         if self.entry is None:
-            return f"{record.name}: left out: {record.notes}"
-        gradient_map = self.entry.gradient_map
-        p, (rows, columns) = gradient_map.parameters, gradient_map.mask.shape
-        facts = [
-            f"{record.points} points",
-            f"{columns} x {rows} pixels of {gradient_map.resolution:.3g} m",
-            f"{gradient_map.mask.mean():.0%} observed",
-            f"{len(self.entry.features)} keypoints",
-            f"length scale {p.length_scale:.3g} m, noise {p.noise:.2g} m",
-        ]
-        return f"{record.name}: {', '.join(facts)}" + (f"; {record.notes}" if record.notes else "")
+            return f"{self.record.name}: left out: {self.record.notes}"
+        return self.entry.summary
 
 
 def detect_mission(
@@ -232,5 +222,5 @@ def _killed(mission: Mission, index: int) -> MappedCloud:
 
 
 def _broken(mission: Mission, index: int, notes: str) -> MappedCloud:
-    stamp = mission.stamp(index)
-    return MappedCloud(SubmapRecord(mission.names[index], stamp, 0, "broken", notes=notes), None)
+    name, stamp = printable(mission.names[index]), mission.stamp(index)
+    return MappedCloud(SubmapRecord(name, stamp, 0, "broken", notes=notes), None)
