@@ -112,8 +112,11 @@ class _Crew(Generic[Result]):
     def _hand_out(self, limit: int) -> None:
         """Keep the workers busy with the tasks below `limit`, or one with a suspect once all are idle."""
         if self._suspects:
-            if all(worker.index is None for worker in self._workers) and (worker := self._idle()):
-                worker.begin(self._suspects[0])
+            if all(worker.index is None for worker in self._workers):
+                while len(self._workers) > 1:  # what they hold may be the memory that was short
+                    self._workers.pop().end()
+                if worker := self._idle():
+                    worker.begin(self._suspects[0])
             return
         while self._due and self._due[0] < limit and (worker := self._idle()):
             worker.begin(self._due.popleft())
@@ -179,7 +182,7 @@ def _interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def _serve(task: Callable[[int], Any], tasks: "connection.Connection") -> None:
+def _serve(task: Callable[[int], Any], tasks: connection.Connection) -> None:
     """Run tasks with one BLAS thread; what would be logged is in the results."""
     Thread(target=_end_with_parent, daemon=True).start()
     logging.disable()
