@@ -2,7 +2,6 @@
 
 import csv
 import json
-import logging
 import shutil
 import subprocess
 import sys
@@ -16,7 +15,6 @@ from conftest import BROKEN, PLACES, STRICT
 
 import terrainloop.config
 import terrainloop.detection.mission  # it must have the true Settings before the demo's are replaced
-from terrainloop.cli import main
 from terrainloop.config import Settings
 from terrainloop.geometry import parameters_of, transform
 from terrainloop.gradient_map import GradientMap
@@ -29,29 +27,6 @@ CONTRACT = [  # DESIGN.md, section 3
 FAST = STRICT.model_copy(
     update={"map": STRICT.map.model_copy(update={"max_points": 550, "resolution": 0.12})}
 )
-
-
-@pytest.fixture(autouse=True)
-def _logging_as_it_was():
-    root = logging.getLogger()
-    handlers, level = root.handlers[:], root.level
-    yield
-    root.handlers[:] = handlers
-    root.setLevel(level)
-
-
-@pytest.fixture
-def cli(monkeypatch, capsys):
-    """Runs ``terrainloop`` with arguments; gives exit code, stdout and stderr."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["terrainloop", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        out, err = capsys.readouterr()
-        return ended.value.code or 0, out, err
-
-    return run
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import errno
 import json
-import logging
 import os
 import shutil
 import signal
@@ -19,7 +18,6 @@ from test_workers import MARK, marked_processes, needs_proc, wait_until
 import terrainloop.cli
 import terrainloop.cli.app
 import terrainloop.cli.terminal
-from terrainloop.cli import main
 from terrainloop.config import Settings
 from terrainloop.detection.run import Run
 from terrainloop.errors import TerrainLoopError
@@ -30,29 +28,6 @@ from terrainloop.io.trajectories import read_trajectory
 THIN = STRICT.model_copy(
     update={"map": STRICT.map.model_copy(update={"max_points": 150, "resolution": 0.5}), "skip_recent": 0}
 )
-
-
-@pytest.fixture(autouse=True)
-def _logging_as_it_was():
-    root = logging.getLogger()
-    handlers, level = root.handlers[:], root.level
-    yield
-    root.handlers[:] = handlers
-    root.setLevel(level)
-
-
-@pytest.fixture
-def cli(monkeypatch, capsys):
-    """Runs ``terrainloop`` with arguments; gives exit code, stdout and stderr."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["terrainloop", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        out, err = capsys.readouterr()
-        return ended.value.code or 0, out, err
-
-    return run
 
 
 @pytest.fixture

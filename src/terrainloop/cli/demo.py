@@ -50,13 +50,13 @@ def command(
     from terrainloop.evaluation.judge import judge
     from terrainloop.io.missions import load_mission
     from terrainloop.report.figures import save_figure
-    from terrainloop.simulation.missions import check_mission_folder, simulate_mission, write_mission
+    from terrainloop.simulation.missions import simulate_mission, write_mission, written_before
 
     terminal = Terminal.open(as_json, quiet, verbose)
     settings = Settings().with_max_false_loops(max_false_loops)
     folder = output / "mission"
     check_folder(folder)
-    check_mission_folder(folder)
+    written_before(folder)  # refuses before the work
     number = worker_count(workers)
     with terminal.progress() as progress:
         simulated = simulate_mission(

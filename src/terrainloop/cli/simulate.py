@@ -22,11 +22,11 @@ def command(
     verbose: Verbose = False,
 ) -> None:
     """Run ``terrainloop simulate``."""
-    from terrainloop.simulation.missions import check_mission_folder, simulate_mission, write_mission
+    from terrainloop.simulation.missions import simulate_mission, write_mission, written_before
 
     terminal = Terminal.open(as_json, quiet, verbose)
     check_folder(output)
-    check_mission_folder(output)
+    written_before(output)  # refuses before the work
     with terminal.progress() as progress:
         mission = simulate_mission(
             world, seed, submaps, sensor, progress=lambda done, total: progress("submaps", done, total)

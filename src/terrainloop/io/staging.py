@@ -43,7 +43,7 @@ def staging(folder: Path) -> Iterator[Path]:
                 folder.rmdir()
 
 
-def publish(aside: Path, folder: Path, names: Iterable[str], stale: Iterable[str]) -> None:
+def publish(aside: Path, folder: Path, names: Iterable[str], stale: Iterable[str | Path]) -> None:
     """Move the files of those names from `aside` into `folder`, after the stale ones there are removed.
 
     Neither an interrupt nor another process that publishes comes in between.

@@ -1,5 +1,6 @@
 """Missions of a simulated rover: submaps, odometry and truth, in memory or as a mission folder."""
 
+import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import se3, transform
-from terrainloop.io.clouds import write_cloud
+from terrainloop.io.clouds import CLOUD_SUFFIXES, write_cloud
 from terrainloop.io.files import write_whole_text
 from terrainloop.io.staging import errors_naming, publish, staging
 from terrainloop.io.trajectories import Trajectory, write_tum
@@ -24,6 +25,8 @@ from terrainloop.simulation.terrain import Terrain, make_terrain
 Array = NDArray[np.float64]
 
 _DESCRIPTION = "simulation.yaml"
+_TRAJECTORIES = ("odometry.tum", "truth.tum")
+_CLOUDS_ONLY = set(CLOUD_SUFFIXES) - {".txt", ".csv"}  # which beside the folder of clouds are notes
 
 
 @dataclass(frozen=True)
@@ -233,53 +236,67 @@ def thin(points: Array, voxel: float) -> Array:
 def write_mission(mission: SimulatedMission, path: FilePath | str) -> None:
     """Write a mission folder: ``clouds/*.ply``, ``odometry.tum``, ``truth.tum``, ``simulation.yaml``.
 
-    All of it is written or nothing; an earlier simulation in the folder is replaced. The first column of
-    the trajectories is the index of the submap.
+    The first column of the trajectories is the index of the submap. All of it is written or nothing. What an
+    earlier run wrote there is replaced; other files are left alone.
 
     Raises
     ------
     TerrainLoopError
-        If there are clouds in the folder that were not simulated.
+        If the folder holds a mission that is not simulated (see `written_before`).
     OSError
         Naming the folder, where it cannot be written.
     """
     folder = FilePath(path)
-    check_mission_folder(folder)
+    stale = [file.relative_to(folder) for file in written_before(folder)]
     clouds = [f"clouds/{i:06d}.ply" for i in range(len(mission.clouds))]
     stamps = np.arange(len(mission.clouds), dtype=float)
     with staging(folder) as aside, errors_naming(folder):
         (aside / "clouds").mkdir()
         for name, cloud in zip(clouds, mission.clouds, strict=True):
             write_cloud(aside / name, cloud)
-        write_tum(aside / "odometry.tum", Trajectory(stamps, mission.odometry))
-        write_tum(aside / "truth.tum", Trajectory(stamps, mission.truth))
+        for name, poses in zip(_TRAJECTORIES, (mission.odometry, mission.truth), strict=True):
+            write_tum(aside / name, Trajectory(stamps, poses))
         description = yaml.safe_dump(_description(mission), sort_keys=False)
         write_whole_text(aside / _DESCRIPTION, lambda file: file.write(description))
-        names = [*clouds, "odometry.tum", "truth.tum", _DESCRIPTION]
-        publish(aside, folder, names, stale=[*_simulated_clouds(folder), *names])
+        publish(aside, folder, [*clouds, *_TRAJECTORIES, _DESCRIPTION], stale)
 
 
-def check_mission_folder(path: FilePath | str) -> None:
-    """Refuse a folder with clouds that `write_mission` would mix with its own.
+def written_before(path: FilePath | str) -> list[FilePath]:
+    """Clouds and trajectories that an earlier `write_mission` wrote to a folder; none if there is no folder.
 
     Raises
     ------
     TerrainLoopError
-        If there are clouds in it, but no description of the simulation that made them.
+        If the folder holds other clouds, or trajectories without a ``simulation.yaml``.
     """
     folder = FilePath(path)
-    own = _simulated_clouds(folder) if (folder / _DESCRIPTION).exists() else []
-    others = sorted({f"clouds/{file.name}" for file in (folder / "clouds").glob("*")} - set(own))
+    count = _submaps_of(folder / _DESCRIPTION)
+    clouds = [file for file in (folder / "clouds").glob("*") if file.suffix.lower() in CLOUD_SUFFIXES]
+    ours = [file for file in clouds if re.fullmatch(r"\d{6}\.ply", file.name) and int(file.stem) < count]
+    others = set(clouds) - set(ours)
+    trajectories = [file for name in _TRAJECTORIES if (file := folder / name).exists()]
+    if count == 0:
+        others |= {*trajectories, *(file for file in folder.glob("*") if file.suffix.lower() in _CLOUDS_ONLY)}
     if others:
         raise TerrainLoopError(
-            expected="a new folder, or one of an earlier simulation",
-            found=f"{others[0]} in {folder}, which was not simulated",
-            mend="give another folder",
+            expected="a folder without a mission, or with one that was simulated",
+            found=f"{min(others)}, which 'terrainloop simulate' did not write",
+            mend="name another folder",
         )
+    return [*trajectories, *ours]
 
 
-def _simulated_clouds(folder: FilePath) -> list[str]:
-    return [f"clouds/{file.name}" for file in (folder / "clouds").glob("[0-9]" * 6 + ".ply")]
+def _submaps_of(description: FilePath) -> int:
+    """How many clouds go with a description of ours; none where there is no such file."""
+    try:
+        content = yaml.safe_load(description.read_bytes())
+    except (OSError, yaml.YAMLError):
+        return 0
+    ours = (
+        isinstance(content, dict)
+        and {"world", "seed", "submaps", "sensor", "setup", "legs"} <= content.keys()
+    )
+    return content["submaps"] if ours and type(content["submaps"]) is int else 0
 
 
 def _description(mission: SimulatedMission) -> dict[str, object]:
