@@ -14,7 +14,7 @@ class TerrainLoopError(Exception):
     """
 
     def __init__(self, *, expected: str, found: str, mend: str) -> None:
-        expected, found, mend = _printable(expected), _shortened(_printable(found)), _printable(mend)
+        expected, found, mend = printable(expected), _shortened(printable(found)), printable(mend)
         super().__init__(f"expected {expected}; found {found}; {mend}")
         self.expected = expected
         self.found = found
@@ -35,7 +35,8 @@ def _shortened(text: str) -> str:
     return f"{text[:head]} ... {text[head + 5 - _LONGEST_QUOTE :]}"
 
 
-def _printable(text: str) -> str:
+def printable(text: str) -> str:
+    """The text with what a terminal would act upon, or could not print, escaped."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

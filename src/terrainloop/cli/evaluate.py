@@ -16,6 +16,13 @@ OVERLAPS = {"box": "bounding-box IoU", "observed": "IoU of the observed ground"}
 CRITERIA = ("pose", "overlap and pose", "overlap")
 
 
+HELP = """Evaluate a run against ground-truth poses: loops, revisits, precision and recall.
+
+Writes precision_recall.csv, precision_recall_curve.csv and precision_recall.png into the folder of
+the run. Pairs of consecutive submaps are left out because odometry already connects them. Run
+detect with --all-pairs to score every other pair."""
+
+
 def command(
     run: Annotated[Path, typer.Argument(help="Output folder of 'terrainloop detect'.")],
     truth: Annotated[Path, typer.Option("--truth", help="True poses, TUM or KITTI, one line per cloud.")],
@@ -52,12 +59,7 @@ def command(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Evaluate a run against ground-truth poses: loops, revisits, precision and recall.
-
-    Writes precision_recall.csv, precision_recall_curve.csv and precision_recall.png into the folder of
-    the run. Pairs of consecutive submaps are left out because odometry already connects them. Run
-    detect with --all-pairs to score every other pair.
-    """
+    """Run ``terrainloop evaluate``."""
     from terrainloop.evaluation.summary import evaluate_run
     from terrainloop.report import can_draw
 

@@ -15,14 +15,18 @@ from terrainloop.cli.terminal import (
     Terminal,
     Verbose,
     WorkersOption,
+    check_output,
     read_settings,
     worker_count,
 )
-from terrainloop.errors import TerrainLoopError
+from terrainloop.errors import printable
 
 if TYPE_CHECKING:
     from terrainloop.gradient_map import GradientMap
     from terrainloop.submap import Submap
+
+
+HELP = "Make the gradient map of one gravity-aligned cloud: elevation, gradient, variance."
 
 
 def command(
@@ -37,16 +41,16 @@ def command(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Make the gradient map of one gravity-aligned cloud: elevation, gradient, variance."""
+    """Run ``terrainloop map``."""
     from terrainloop.detection.detector import map_submap
     from terrainloop.io.clouds import read_cloud
 
     terminal = Terminal.open(as_json, quiet, verbose)
     settings = read_settings(preset, config, seed)
-    if output.suffix.lower() not in (".npz", ".tif", ".tiff"):
-        raise TerrainLoopError(
-            expected="an output that ends in .npz or .tif", found=str(output), mend="change -o"
-        )
+    check_output(output, (".npz", ".tif", ".tiff"))
+    picture = output.with_suffix(".png")
+    if png:
+        check_output(picture, (".png",))
     submap = read_cloud(cloud)
     with terminal.progress() as progress:
         progress("map", 0, 1)
@@ -54,16 +58,17 @@ def command(
         progress("map", 1, 1)
     _write(gradient_map, output, cloud)
     written = [str(output)]
-    if png:
-        from terrainloop.report.figures import figure_map, save_figure
+    try:
+        if png:
+            from terrainloop.report.figures import figure_map, save_figure
 
-        picture = output.with_suffix(".png")
-        save_figure(figure_map(submap, gradient_map), picture)
-        written.append(str(picture))
-    terminal.result(
-        _summary(submap, gradient_map) | {"written": written},
-        lambda console: _show(console, submap, gradient_map, written),
-    )
+            save_figure(figure_map(submap, gradient_map), picture)
+            written.append(str(picture))
+    finally:  # the map is there, whatever becomes of its picture
+        terminal.result(
+            _summary(submap, gradient_map) | {"written": written},
+            lambda console: _show(console, submap, gradient_map, written),
+        )
 
 
 def _summary(submap: "Submap", gradient_map: "GradientMap") -> dict[str, Any]:
@@ -89,7 +94,7 @@ def _show(console: Console, submap: "Submap", gradient_map: "GradientMap", writt
         f"{len(submap)} points -> {columns} x {rows} pixels of {gradient_map.resolution:.3g} m, "
         f"{gradient_map.mask.mean():.0%} known ground\n"
         f"length scale {parameters.length_scale:.3g} m, relief {parameters.variance**0.5:.3g} m, "
-        f"noise {parameters.noise:.3g} m\nwritten: {', '.join(written)}"
+        f"noise {parameters.noise:.3g} m\nwritten: {printable(', '.join(written))}"
     )
 
 

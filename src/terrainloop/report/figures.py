@@ -13,6 +13,7 @@ from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.summary import Evaluation
 from terrainloop.geometry import Array, se2, transform, yaw_of
 from terrainloop.gradient_map import GradientMap
+from terrainloop.io.files import write_whole
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.correspondences import Associations, associate
 from terrainloop.matching.overlay import Overlay
@@ -43,7 +44,8 @@ def figure_map(submap: Submap, gradient_map: GradientMap) -> Figure:
     figure = Figure(figsize=(13, 7.5), layout="constrained")
     figure.suptitle(
         f"{submap.name}: {len(submap):,} points, length scale {gradient_map.parameters.length_scale:.3g} m, "
-        f"{gradient_map.resolution:.3g} m per pixel"
+        f"{gradient_map.resolution:.3g} m per pixel",
+        parse_math=False,  # here and below: names may hold dollars
     )
     first = figure.add_subplot(2, 3, 1)
     drawn = submap.points[:: max(1, len(submap) // DRAWN_POINTS)]
@@ -78,7 +80,9 @@ def figure_match(source: MapEntry, target: MapEntry, candidate: LoopCandidate, s
     inliers = get_inliers(associations, T[None], inlier_radius_of(settings, target_map))[0]
     figure = Figure(figsize=(13, 11), layout="constrained")
     verdict = "loop closure" if candidate else "no loop closure"
-    figure.suptitle(f"{candidate.source} to {candidate.target}: {verdict} ({candidate.reason})")
+    figure.suptitle(
+        f"{candidate.source} to {candidate.target}: {verdict} ({candidate.reason})", parse_math=False
+    )
     grid = figure.add_gridspec(2, 2)
     left, right = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
     for axes, gradient_map, role, name in (
@@ -127,7 +131,12 @@ def figure_mission(
         axes.plot(*ends.T, color=SOURCE_COLOUR, linewidth=1.6, label=None if number else "loop closure")
     for name, pose in zip(names, poses, strict=True):
         axes.annotate(
-            name.lstrip("0") or "0", pose[:2, 3], fontsize=7, xytext=(3, 3), textcoords="offset points"
+            name.lstrip("0") or "0",
+            pose[:2, 3],
+            fontsize=7,
+            xytext=(3, 3),
+            textcoords="offset points",
+            parse_math=False,
         )
     axes.legend(loc="best")
     _finish(axes, title)
@@ -195,10 +204,10 @@ def _draw_thresholds(axes: Axes, evaluation: Evaluation) -> None:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a PNG; the same figure gives the same bytes."""
+    """Write a PNG, whole or not at all; the same figure gives the same bytes."""
     if path.suffix.lower() != ".png":
         raise TerrainLoopError(expected="a picture that ends in .png", found=str(path), mend="rename it")
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    write_whole(path, lambda file: figure.savefig(file, format="png", dpi=110, metadata={"Software": None}))
 
 
 def _steepest(gradient_map: GradientMap) -> float:
@@ -271,5 +280,5 @@ def _show_both(axes: Axes, source_map: GradientMap, target_map: GradientMap, T_p
 
 
 def _finish(axes: Axes, title: str) -> None:
-    axes.set(title=title, xlabel="x, m", ylabel="y, m", aspect="equal")
-    axes.title.set_fontsize(10)
+    axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    axes.set_title(title, fontsize=10, parse_math=False)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import se3, transform
 from terrainloop.io.clouds import CLOUD_SUFFIXES, write_cloud
-from terrainloop.io.files import write_whole
+from terrainloop.io.files import write_whole_text
+from terrainloop.io.staging import errors_naming, publish, staging
 from terrainloop.io.trajectories import Trajectory, write_tum
 from terrainloop.simulation.odometry import Drift, estimate, true_poses
 from terrainloop.simulation.paths import revisiting_path
@@ -236,26 +237,29 @@ def thin(points: Array, voxel: float) -> Array:
 def write_mission(mission: SimulatedMission, path: FilePath | str) -> None:
     """Write a mission folder: ``clouds/*.ply``, ``odometry.tum``, ``truth.tum``, ``simulation.yaml``.
 
-    The first column of the trajectories is the index of the submap. What an earlier run wrote there is
-    replaced; other files are left alone.
+    The first column of the trajectories is the index of the submap. All of it is written or nothing. What an
+    earlier run wrote there is replaced; other files are left alone.
 
     Raises
     ------
     TerrainLoopError
         If the folder holds a mission that is not simulated (see `written_before`).
+    OSError
+        Naming the folder, where it cannot be written.
     """
     folder = FilePath(path)
-    for file in written_before(folder):
-        file.unlink(missing_ok=True)
-    (folder / "clouds").mkdir(parents=True, exist_ok=True)
-    description = yaml.safe_dump(_description(mission), sort_keys=False).encode()
-    # First what marks the files as ours, and the poses before the clouds: they do not fit half a mission.
-    write_whole(folder / _DESCRIPTION, lambda file: file.write(description))
+    stale = [file.relative_to(folder) for file in written_before(folder)]
+    clouds = [f"clouds/{i:06d}.ply" for i in range(len(mission.clouds))]
     stamps = np.arange(len(mission.clouds), dtype=float)
-    for name, poses in zip(_TRAJECTORIES, (mission.odometry, mission.truth), strict=True):
-        write_tum(folder / name, Trajectory(stamps, poses))
-    for i, cloud in enumerate(mission.clouds):
-        write_cloud(folder / "clouds" / f"{i:06d}.ply", cloud)
+    with staging(folder) as aside, errors_naming(folder):
+        (aside / "clouds").mkdir()
+        for name, cloud in zip(clouds, mission.clouds, strict=True):
+            write_cloud(aside / name, cloud)
+        for name, poses in zip(_TRAJECTORIES, (mission.odometry, mission.truth), strict=True):
+            write_tum(aside / name, Trajectory(stamps, poses))
+        description = yaml.safe_dump(_description(mission), sort_keys=False)
+        write_whole_text(aside / _DESCRIPTION, lambda file: file.write(description))
+        publish(aside, folder, [*clouds, *_TRAJECTORIES, _DESCRIPTION], stale)
 
 
 def written_before(path: FilePath | str) -> list[FilePath]:
