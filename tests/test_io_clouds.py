@@ -742,5 +742,5 @@ def test_real_airborne_lidar():
 def test_a_raster_of_heights_is_no_cloud(tmp_path):
     path = tmp_path / "dem.csv"
     np.savetxt(path, np.random.default_rng(0).normal(size=(150, 200)), delimiter=",")
-    with pytest.raises(TerrainLoopError, match="200 numbers a line and no header: a raster"):
+    with pytest.raises(TerrainLoopError, match="200 numbers per line and no header: a raster"):
         read_cloud(path)

@@ -71,7 +71,7 @@ except _PackageNotFoundError:  # run from a source tree that is not installed
 
 
 def __getattr__(name: str) -> object:
-    # Loaded when first asked for, so that the command line answers --help at once.
+    # Loaded on first use, so that the command line answers --help at once.
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(_import_module(f"{__name__}.{_HOME[name]}"), name)

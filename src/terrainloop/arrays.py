@@ -9,7 +9,7 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 def read_only(array: NDArray[Scalar]) -> NDArray[Scalar]:
-    """A view that cannot be written through; the array itself, which may be the caller's, stays as it was."""
+    """A read-only view; the array itself, which may be the caller's, stays writable."""
     view = array.view()
     view.setflags(write=False)
     return view

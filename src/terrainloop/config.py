@@ -1,4 +1,4 @@
-"""Settings: few, in metres or dimensionless, derived from one another where they can be."""
+"""Settings: few, in metres or dimensionless, derived from one another where possible."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,7 +17,7 @@ class _Frozen(BaseModel):
 
 
 class MapSettings(_Frozen):
-    """How a submap becomes a gradient map."""
+    """How a gradient map is made from a submap."""
 
     solver: Literal["spline", "exact"] = Field(
         "spline", description="spline: every point, in milliseconds; exact: dense, for a few thousand points"
@@ -50,7 +50,7 @@ class MapSettings(_Frozen):
         None, ge=1e-5, le=1e4, description="grid spacing, m per pixel; null: a sixth of the length scale"
     )
     remove_plane: bool = Field(
-        True, description="subtract a robust plane fit, and drop gross outliers, before; add its slope after"
+        True, description="subtract a robust plane fit and drop gross outliers; add its slope afterwards"
     )
     max_variance_ratio: float = Field(
         0.25,
@@ -68,7 +68,7 @@ class FeatureSettings(_Frozen):
 
 
 class MatchSettings(_Frozen):
-    """How two maps are compared, and what makes a loop."""
+    """How two maps are compared, and what makes a loop closure."""
 
     decision: Literal["evidence", "inliers"] = Field(
         "evidence", description="evidence: number of false alarms; inliers: Algorithm 1 of the paper"
@@ -82,7 +82,7 @@ class MatchSettings(_Frozen):
     )
     min_inliers: int = Field(5, ge=2, le=10**6, description="inliers: minimum number of inliers, n_min")
     max_ssd_ratio: float = Field(
-        0.5, gt=0, le=1e6, description="inliers: largest SSD, as a share of what unrelated ground would give"
+        0.5, gt=0, le=1e6, description="inliers: largest SSD, relative to that of unrelated ground"
     )
     refine: bool = Field(
         True, description="inliers: refine the pose by least squares on all overlapping gradients"
@@ -103,16 +103,26 @@ class Calibration(_Frozen):
     pixels_per_length_scale: float = Field(2.0, gt=0, description="field: pixels per length scale")
     max_pixels: int = Field(96, ge=8, description="field: pixels across; larger maps take twice the spacing")
     blur: float = Field(0.4, gt=0, description="field: standard deviation of the low-pass filter, pixels")
-    spectrum_smoothing: float = Field(1.5, gt=0, description="field: of the power spectrum, cycles per width")
+    spectrum_smoothing: float = Field(
+        1.5, gt=0, description="field: smoothing of the power spectrum, cycles per width"
+    )
     whitening_floor: float = Field(0.3, gt=0, description="field: added to the spectrum, share of its mean")
     clip: float = Field(1.5, gt=0, description="field: soft-clipping scale, robust standard deviations")
     # Hypotheses (section 2)
-    rotation_step: float = Field(1.0, gt=0, description="search: pixels ground moves by, RMS, per rotation")
-    min_shared_area: float = Field(20.0, gt=0, description="search: shared area, squared length scales")
-    min_separation: float = Field(1.5, gt=0, description="search: between two places, length scales")
-    peak_threshold: float = Field(6.0, gt=0, description="search: r^2 of a candidate, in units of its mean")
+    rotation_step: float = Field(
+        1.0, gt=0, description="search: RMS motion of the ground per rotation, pixels"
+    )
+    min_shared_area: float = Field(
+        20.0, gt=0, description="search: smallest shared area, squared length scales"
+    )
+    min_separation: float = Field(
+        1.5, gt=0, description="search: smallest distance of two places, length scales"
+    )
+    peak_threshold: float = Field(
+        6.0, gt=0, description="search: smallest r^2 of a candidate, in units of its mean"
+    )
     wraparound: float = Field(
-        0.8, gt=0, le=1, description="search: FFT size, share of that without wrap-around"
+        0.8, gt=0, le=1, description="search: size of the FFT, share of that without wrap-around"
     )
     candidates: int = Field(11, ge=1, description="search: places whose surprisal is kept for the null")
     dense_hypotheses: int = Field(2, ge=0, description="hypotheses of the search that are refined")
@@ -123,15 +133,17 @@ class Calibration(_Frozen):
     independent_tests: float = Field(
         0.05, gt=0, description="independent tests per rotation step and squared length scale of shift"
     )
-    max_correlation: float = Field(0.999, gt=0, lt=1, description="correlation beyond which none counts more")
+    max_correlation: float = Field(0.999, gt=0, lt=1, description="correlations above it count as this one")
     # Decision (section 3)
-    min_correlation: float = Field(0.25, ge=0, lt=1, description="of the fields of a loop closure")
+    min_correlation: float = Field(
+        0.25, ge=0, lt=1, description="smallest correlation of the fields of a loop closure"
+    )
     ambiguity_ratio: float = Field(0.5, gt=0, description="surprisal of a rival pose, share of the best's")
     ambiguity_chance: float = Field(0.01, gt=0, description="NFA above which a rival is left to chance")
     # Covariance (section 4)
     block: float = Field(2.0, gt=0, description="side of the independent blocks of ground, length scales")
     usual_strain: float = Field(0.004, ge=0, description="standard deviation of a submap's strain, a priori")
-    usual_strain_samples: float = Field(3.0, gt=0, description="samples that this prior is worth")
+    usual_strain_samples: float = Field(3.0, gt=0, description="number of samples that this prior is worth")
     motion_by_strain: _Triple = Field(
         (2.0, 2.0, 0.5), description="variance of x, y, z per squared metre of reach, per strain variance"
     )
@@ -141,19 +153,19 @@ class Calibration(_Frozen):
 
 
 class Settings(_Frozen):
-    """Everything a run depends on; written beside every result.
+    """Everything that a run depends on; written beside every result.
 
     ``Settings(max_false_loops=0.1)`` is short for ``Settings(match={"max_false_loops": 0.1})``.
     """
 
     # The comments of YAML sections are Field descriptions; docstrings are gone under python -OO.
-    map: MapSettings = Field(MapSettings(), description="how a submap becomes a gradient map")
+    map: MapSettings = Field(MapSettings(), description="how a gradient map is made from a submap")
     features: FeatureSettings = Field(FeatureSettings(), description="keypoints on the gradient map")
     match: MatchSettings = Field(
         MatchSettings(), description="how two maps are compared, and what makes a loop closure"
     )
     skip_recent: int = Field(
-        1, ge=0, le=10**6, description="submaps just before the query that are not compared"
+        1, ge=0, le=10**6, description="number of submaps just before the query that are not compared with it"
     )
     seed: int = Field(0, ge=0, lt=2**63, description="seed of the random number generator")
     calibration: Calibration = Field(
@@ -163,7 +175,7 @@ class Settings(_Frozen):
     @model_validator(mode="before")
     @classmethod
     def _one_knob(cls, data: Any) -> Any:
-        """Accept `max_false_loops` at the top, where one looks for the one knob first."""
+        """Accept `max_false_loops` at the top level, where users look for it first."""
         if not isinstance(data, dict) or "max_false_loops" not in data:
             return data
         rest = {name: value for name, value in data.items() if name != "max_false_loops"}
@@ -221,12 +233,12 @@ class Settings(_Frozen):
 
     @classmethod
     def from_yaml(cls, path: Path | str) -> "Settings":
-        """Read settings; what the file leaves out keeps its default.
+        """Read settings; those missing from the file keep their defaults.
 
         Raises
         ------
         TerrainLoopError
-            If the file cannot be read, is no YAML mapping, or holds an unknown or impossible value.
+            If the file cannot be read, is not a YAML mapping, or has an unknown or impossible value.
         """
         content = read_yaml(path)
         try:

@@ -1,4 +1,4 @@
-"""A submap at rest: what is kept of it to be compared with others, and its bytes."""
+"""A stored submap: what is kept of it to be compared with others, and its bytes."""
 
 import io
 import json
@@ -31,7 +31,7 @@ class MapEntry:
     features : Features
         Keypoints of the gradient magnitude in the observed area.
     field : Field
-        At the spacing at which the map is searched.
+        Gradient field at the spacing at which the map is searched.
     """
 
     record: SubmapRecord
@@ -99,7 +99,7 @@ class MapEntry:
         Raises
         ------
         TerrainLoopError
-            If the bytes are no such entry.
+            If the bytes are not such an entry.
         """
         try:
             with zipfile.ZipFile(io.BytesIO(data)) as file:
@@ -124,7 +124,7 @@ class MapEntry:
 
 
 def _array(file: zipfile.ZipFile, name: str) -> np.ndarray[Any, Any]:
-    """An array as `numpy.savez` stores it, of no more bytes than there are, whatever its header announces."""
+    """An array as `numpy.savez` stores it, never larger than the data, whatever its header announces."""
     if file.getinfo(name).compress_type != zipfile.ZIP_STORED:
         raise ValueError(f"{name} is compressed")
     content = io.BytesIO(file.read(name))
@@ -153,7 +153,7 @@ def _record(data: bytes) -> SubmapRecord:
 
 
 def _part(array: Callable[[str], Any], prefix: str, kind: type[Any]) -> dict[str, Any]:
-    """Fields of a data class from their arrays; scalars, strings and pairs as such."""
+    """Fields of a data class from their arrays; scalars, strings and pairs are unpacked."""
     values = {f.name: array(f"{prefix}.{f.name}") for f in fields(kind)}
     return {
         name: value.item() if value.ndim == 0 else tuple(value.tolist()) if name == "origin" else value
@@ -162,7 +162,7 @@ def _part(array: Callable[[str], Any], prefix: str, kind: type[Any]) -> dict[str
 
 
 def _checked_features(features: Features) -> Features:
-    """The features, if their arrays fit together: the compiled core would read beyond them."""
+    """The features, if their arrays fit together: else the compiled core would read beyond them."""
     count = len(features.positions)
     width, kind_of_number = _DESCRIPTORS[features.kind]
     vectors = (features.scales, features.orientations, features.responses)

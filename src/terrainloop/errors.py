@@ -4,13 +4,13 @@ _LONGEST_QUOTE = 300  # characters of what was found
 
 
 class TerrainLoopError(Exception):
-    """Input that cannot be worked with: what was expected, what was found, how to mend it.
+    """Input that cannot be used: what was expected, what was found, and how to fix it.
 
     Parameters
     ----------
     expected, found, mend : str
-        Three short clauses, shown as one line. What was found may quote a file: its middle is cut out where
-        it is long, and characters that a terminal would act upon are escaped.
+        Three short clauses, shown as one line; `mend` is the fix. What was found may quote a file: the middle
+        of a long quote is left out, and control characters are escaped.
     """
 
     def __init__(self, *, expected: str, found: str, mend: str) -> None:
@@ -36,7 +36,7 @@ def _shortened(text: str) -> str:
 
 
 def printable(text: str) -> str:
-    """The text with what a terminal would act upon, or could not print, escaped."""
+    """The text with everything escaped that a terminal would act upon or could not print."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -1,4 +1,4 @@
-"""Keypoints and descriptors of a gradient map where it can be trusted: SURF (the paper's), SIFT, ORB."""
+"""Keypoints and descriptors of a gradient map in its observed area: SURF (the paper's), SIFT, ORB."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,10 +16,10 @@ from terrainloop.gradient_map import GradientMap
 # A map's contrast: the magnitude that all but its steepest hundredth stay below. Thresholds and grey
 # levels are relative to it, so that flat ground gives as many keypoints as rough ground does.
 CONTRAST_PERCENTILE = 99.0
-# Below this part of the contrast a SURF response (the square of a curvature) is rounding, not shape.
+# Below this share of the contrast a SURF response (the square of a curvature) is rounding error.
 SURF_NOISE = 1e-4
-# OpenCV's defaults (0.04 and 20) are for photographs; a Gaussian-process map is smooth, so go down to what
-# 8 bits resolve. The strongest keypoints are picked afterwards.
+# OpenCV's defaults (0.04 and 20) are for photographs; a Gaussian-process map is smooth, so the thresholds are
+# as low as 8 bits resolve. The strongest keypoints are selected afterwards.
 SIFT_CONTRAST_THRESHOLD = 0.005
 ORB_FAST_THRESHOLD = 2
 
@@ -115,7 +115,7 @@ def _orb(image: NDArray[np.float32], allowed: NDArray[np.bool_], contrast: float
     if not found:
         return np.empty((0, 5)), np.empty((0, 32), dtype=np.uint8)
     keypoints = _from_opencv(found)
-    # OpenCV scales the pixel indices of a shrunk image; pixel centres lie (shrinking - 1) / 2 further on.
+    # OpenCV scales the pixel indices of a shrunk image; pixel centres are (shrinking - 1) / 2 further on.
     keypoints[:, :2] += keypoints[:, 2:3] / orb.getPatchSize() - 0.5
     return _strongest(keypoints, descriptors, allowed, count)
 

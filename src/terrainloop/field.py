@@ -39,7 +39,7 @@ class Field:
     spacing : float
         Metres per pixel.
     length_scale : float
-        Of the process that made the map, metres.
+        Length scale of the Gaussian process of the map, metres.
     """
 
     x: Image
@@ -133,7 +133,7 @@ def rotate_field(field: Field, affine: Array, shape: tuple[int, int]) -> tuple[I
     ----------
     field : Field
     affine : array, (3, 3)
-        From (column, row) of the result to (column, row) of the field; a rotation up to its scale.
+        Affine map from (column, row) of the result to (column, row) of the field; a rotation up to its scale.
     shape : tuple of int
         Rows and columns of the result.
     """

@@ -65,7 +65,7 @@ def translation(offset: ArrayLike) -> Array:
 
 
 def transform(T: Array, points: ArrayLike) -> Array:
-    """Points (..., 2) or (..., 3) taken through an SE(2) or SE(3) transform."""
+    """Apply an SE(2) or SE(3) transform to points (..., 2) or (..., 3)."""
     return np.asarray(points, dtype=float) @ T[:-1, :-1].T + T[:-1, -1]
 
 
@@ -138,21 +138,21 @@ TangentOrder = Literal["gtsam", "g2o"]
 
 
 def tangent_covariance(T: Array, covariance: Array, order: TangentOrder = "gtsam") -> Array:
-    """Covariance of a transform's parameters as that of its tangent vector.
+    """Convert the covariance of a transform's parameters to that of its tangent vector.
 
     Parameters
     ----------
     T : array, (4, 4)
         SE(3), its pitch not +-90 degrees.
     covariance : array, (6, 6)
-        Of (x, y, z, roll, pitch, yaw), the parameters of `T` (see `se3`), metres and radians.
+        Covariance of (x, y, z, roll, pitch, yaw), the parameters of `T` (see `se3`), metres and radians.
     order : {"gtsam", "g2o"}
-        Rotation first, as GTSAM's noise models have it, or translation first, as g2o files do.
+        Rotation first, as in GTSAM's noise models, or translation first, as in g2o files.
 
     Returns
     -------
     array, (6, 6)
-        Of the tangent vector xi in T exp(xi).
+        Covariance of the tangent vector xi in T exp(xi).
     """
     _, _, _, roll, pitch, _ = parameters_of(T)
     jacobian = np.zeros((6, 6))

@@ -32,7 +32,7 @@ FAR = 10.0  # radii of the map, from which its frame's origin is no longer near 
 
 _IMAGES = ("elevation", "gradient_x", "gradient_y", "variance", "gradient_variance")
 _LARGEST = 1e12  # of any number of a map: its square is far from the end of single precision
-_FINEST = 1e4  # pixels of a length scale; filters of that width are slow, and there is no use for them
+_FINEST = 1e4  # pixels per length scale; filters of that width are slow, and have no use
 _MAKE_ONE = "make one with 'terrainloop map CLOUD -o map.npz'"
 _LITTLE = 0.05  # share of observed pixels below which something is wrong with the points
 
@@ -42,7 +42,7 @@ class GradientMap(ReadOnlyArrays):
     """A submap's terrain on a regular grid.
 
     All arrays are read-only (rows, columns) float32 with rows along y and columns along x; pixel
-    (row, column) lies at ``origin + resolution * (column, row)`` in the frame of the cloud.
+    (row, column) is at ``origin + resolution * (column, row)`` in the frame of the cloud.
 
     Attributes
     ----------
@@ -51,9 +51,9 @@ class GradientMap(ReadOnlyArrays):
     gradient_x, gradient_y : array
         Slope along x and y, dimensionless.
     variance : array
-        Of the elevation (I_v of the paper), metres squared.
+        Variance of the elevation (I_v of the paper), metres squared.
     gradient_variance : array
-        Of one gradient component (mean of the two), dimensionless.
+        Variance of one gradient component (mean of the two), dimensionless.
     mask : array of bool
         True where the ground is known: the variance is a small part of the prior's.
     origin : tuple of float
@@ -61,7 +61,7 @@ class GradientMap(ReadOnlyArrays):
     resolution : float
         Metres per pixel.
     parameters : Hyperparameters
-        Of the Gaussian process that made the map.
+        Hyperparameters of the Gaussian process that made the map.
 
     Raises
     ------
@@ -190,7 +190,7 @@ class GradientMap(ReadOnlyArrays):
         max_points : int, optional
             Drawn at random if the cloud has more; all are used if not given.
         fit_points : int or None
-            Of these, drawn for the fit; None: all (see `fit_hyperparameters`).
+            Points of these drawn for the fit; None: all (see `fit_hyperparameters`).
         remove_plane : bool
             Subtract the best plane before and add its slope back after.
         local_noise : bool
@@ -272,7 +272,7 @@ class GradientMap(ReadOnlyArrays):
         Raises
         ------
         TerrainLoopError
-            If the bytes are no such map, or what they hold makes no map.
+            If the bytes are not such a map, or their content is not valid.
         """
         try:
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -300,7 +300,7 @@ class GradientMap(ReadOnlyArrays):
         Raises
         ------
         TerrainLoopError
-            If the file is no such map, or what it holds makes no map.
+            If the file is not such a map, or its content is not valid.
         """
         try:
             if not Path(path).is_file():

@@ -26,8 +26,8 @@ class LoopCandidate:
     T_target_source : array, (4, 4)
         Takes points of source into the frame of target, metres.
     covariance : array, (6, 6)
-        Of (x, y, z, roll, pitch, yaw), the parameters of `T_local`, in metres and radians. NaN where no
-        transform could be estimated. `information` converts it for GTSAM and g2o.
+        Covariance of (x, y, z, roll, pitch, yaw), the parameters of `T_local`, in metres and radians. NaN
+        where no transform could be estimated. `information` converts it for GTSAM and g2o.
     inliers : int
         Associations that agree with the transform (n of Algorithm 1).
     ssd : float
@@ -37,15 +37,15 @@ class LoopCandidate:
     overlap : float
         Intersection over union of the two maps' observed areas at this transform, 0 to 1.
     score : float
-        Higher is surer; comparable across the pairs of a run. ``-log_nfa`` where a run decides by evidence
-        (`NO_EVIDENCE` where no hypothesis could be weighed), `inlier_score` where it decides by inliers.
+        Higher is more certain; comparable across the pairs of a run. ``-log_nfa`` where a run decides by
+        evidence (`NO_EVIDENCE` where no hypothesis could be weighed), `inlier_score` where by inliers.
     accepted : bool
     reason : str
-        In words, why it was accepted or not.
+        Why it was accepted or rejected, in words.
     found_by : {"dense", "sparse", ""}
         What proposed the pose: the search of all poses, or the keypoints.
     correlation : float
-        Of the two gradient fields over the shared ground, -1 to 1; NaN where it was not computed.
+        Correlation of the two gradient fields over the shared ground, -1 to 1; NaN if not computed.
     log_nfa : float
         Decimal logarithm of the number of false alarms (NFA): how many matches at least as good a pair of
         unrelated submaps yields by chance. NaN where the run decides by inliers.

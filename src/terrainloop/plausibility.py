@@ -1,28 +1,28 @@
-"""What about a cloud is unlikely for a submap of the ground, though a map could be made of it."""
+"""Properties of a cloud that are implausible for a submap of the ground, although it can be mapped."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_SAMPLE = 20_000  # points that are looked at
+_SAMPLE = 20_000  # points that are examined
 _ACROSS = 32  # cells along the cloud, or fewer where it is sparse ...
 _PER_CELL = 16  # ... as each should hold so many points
-_FEWEST = 8  # points of a cell that is judged
+_FEWEST = 8  # points that a cell needs to be examined
 _LAYERED = 0.3  # share of cells with two layers; scans of trees and undergrowth reach 0.17
 _THICK = 1.5  # median thickness of a cell over its side; scans of undergrowth reach 1.2
 _SMALLEST, _LARGEST = 0.5, 500.0  # metres across
-_STEEP = np.radians(40.0)  # loose ground gives way before
+_STEEP = np.radians(40.0)  # beyond the angle of repose of loose ground
 _TILTED = np.radians(20.0)  # a slope this steep is rarely ...
 _SMOOTH = 0.02  # ... as even as that: relief about its plane over its width
 
 
 def plausibility_warnings(bulk: Array) -> tuple[str, ...]:
-    """What casts doubt on a cloud, in words.
+    """Warnings about a cloud, in words.
 
     Two layers above each other, points that fill a volume, a mean plane steeper than ground, or an even
     one that is tilted like a sensor, and extents that suggest another unit. A cloud upside down, a tilt of
-    rough ground within the slopes of nature, and small clouds in centimetres cannot be told from sound ones.
+    rough ground within natural slopes, and small clouds in centimetres cannot be detected.
 
     Parameters
     ----------

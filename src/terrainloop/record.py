@@ -1,4 +1,4 @@
-"""What is kept of a submap once its points are gone, apart from its map."""
+"""What is kept of a submap without its points, apart from its map."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -26,7 +26,7 @@ class SubmapRecord:
         Corners, anticlockwise, of the convex hull of x and y in the submap's own frame, metres, rounded to
         millimetres; empty if broken.
     notes : str
-        Repairs and warnings, or what is wrong.
+        Repairs and warnings, or the error of a broken cloud.
     session : str
         Name of the session the submap belongs to; empty if there is only one.
     odometry : array, (4, 4), or None

@@ -1,4 +1,4 @@
-"""What the machine can spare: memory and processors."""
+"""Available memory and processors."""
 
 import operator
 import os

@@ -1,4 +1,4 @@
-"""YAML as its version 1.2 reads it, from files of settings only: short, flat and without surprises."""
+"""YAML 1.2 for settings files: short, flat and strict."""
 
 import re
 from collections import Counter
@@ -47,7 +47,7 @@ class _Loader(yaml.SafeLoader):
     _depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """Refuse references, by which a few lines can stand for gigabytes, and endless nesting."""
+        """Refuse references, by which a few lines can expand to gigabytes, and endless nesting."""
         if self.check_event(yaml.AliasEvent):
             raise ValueError("a reference (*), which settings do not need")
         self._depth += 1
@@ -58,7 +58,7 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Refuse keys that repeat: the last one would win in silence."""
+        """Refuse repeated keys: the last one would silently win."""
         counts = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
         key, times = max(counts.items(), key=lambda item: item[1], default=("", 0))
         if times > 1:

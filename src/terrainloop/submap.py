@@ -1,4 +1,4 @@
-"""Submaps: gravity-aligned point clouds, one for each place, checked and cleaned on the way in."""
+"""Submaps: gravity-aligned point clouds, checked and cleaned when they are made."""
 
 import logging
 import os
@@ -27,8 +27,8 @@ _ALL_ON_A_LINE = 1e-3  # width over length of a cloud that covers no area
 _LARGEST_SIDE = 2000.0  # metres; submaps are tens to hundreds of metres across ...
 _LARGEST_CELL = 25.0  # ... and hold far more than one point in so many square metres
 _FLAT = 0.2  # thickness over width of what surely is a surface
-_STEEPEST = np.radians(70.0)  # a surface steeper than this is no ground
-_TALLEST = 3.0  # height over width of what surely is no ground
+_STEEPEST = np.radians(70.0)  # a surface steeper than this is not ground
+_TALLEST = 3.0  # height over width of what surely is not ground
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -39,26 +39,26 @@ class Submap(ReadOnlyArrays):
     ----------
     points : array_like, (N, 3)
         Metres. Rows with NaN or infinity and exact repeats are dropped; the rest keep their order and
-        their frame, however far from its origin they lie.
+        their frame, however far its origin is.
     name, session : str
         Without path separators, commas and control characters: they go into file names and CSVs.
     stamp : float
         Seconds, or the index within the mission.
     intensity : array_like, (N,), optional
-        One value a point, kept in step with `points`.
+        One value per point; rows dropped from `points` are dropped here too.
     repairs : tuple of str
-        What was repaired on the way in, in words; what construction repairs is added and logged.
+        Repairs made while reading, in words; those made here are appended and logged.
 
     Attributes
     ----------
     warnings : tuple of str
-        What is unlikely for a submap of the ground, in words (see `plausibility_warnings`); logged, too.
+        What is implausible for a submap of the ground, in words (see `plausibility_warnings`); also logged.
 
     Raises
     ------
     TerrainLoopError
-        Where no elevation map could come of the points: wrong shape, fewer than `MIN_POINTS`, no area,
-        millimetres, coordinates too large for their type, z not up; or a name, session or stamp that is none.
+        If no elevation map can be made of the points: wrong shape, fewer than `MIN_POINTS`, no area,
+        millimetres, coordinates too large for their type, z not up; or if name, session or stamp is invalid.
     """
 
     points: Array
@@ -141,7 +141,7 @@ def _numbers(points: ArrayLike) -> NDArray[np.generic]:
         raise TerrainLoopError(
             expected="numbers of shape (N, 3), the columns x, y and z in metres",
             found=f"shape {array.shape} of {array.dtype}",
-            mend="give one row a point (transpose if x, y and z are the rows)",
+            mend="give one row per point (transpose if x, y and z are the rows)",
         )
     return array
 
@@ -150,7 +150,7 @@ def _one_a_point(values: ArrayLike, count: int) -> Array:
     array = np.asarray(values)
     if array.dtype.kind not in "fiu" or array.shape != (count,):
         raise TerrainLoopError(
-            expected=f"one intensity a point, shape ({count},)",
+            expected=f"one intensity per point, shape ({count},)",
             found=f"shape {array.shape} of {array.dtype}",
             mend="give as many numbers as points, or none",
         )
@@ -200,7 +200,7 @@ def _check_units(extent: Array, count: int) -> None:
 
 
 def _check_precision(largest: float, dtype: np.dtype[np.generic]) -> list[str]:
-    """Refuse a type that has rounded the coordinates away; say so where only single precision would."""
+    """Refuse a type that has rounded the coordinates away; report if only single precision would."""
     steps_of = np.float64 if dtype.kind in "iu" else dtype.type
     if np.spacing(steps_of(largest)) > _COARSEST:
         raise TerrainLoopError(
@@ -225,7 +225,7 @@ def _check_area(bulk: Array) -> None:
 
 
 def _check_gravity(bulk: Array, extent: Array) -> None:
-    """Refuse what is surely not seen with z up: a wall-like sheet, or a tower."""
+    """Refuse what surely does not have z up: a wall-like sheet, or a tower."""
     variances, axes = np.linalg.eigh(np.cov(bulk.T))
     slope = np.arccos(min(abs(axes[2, 0]), 1.0))
     wall = variances[0] < _FLAT**2 * variances[1] and slope > _STEEPEST

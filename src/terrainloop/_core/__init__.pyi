@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 _Array = NDArray[np.float64]
 
 VARIANT: str
-"""Which build of the core this is: native, portable, x86-64-v2 or x86-64-v3."""
+"""Build of the core: native, portable, x86-64-v2 or x86-64-v3."""
 
 LEVEL: int
-"""Level of x86-64 that its compiler made use of; 0 for less than 2, or another architecture."""
+"""Level of x86-64 that it was compiled for; 0 for less than 2, or another architecture."""
 
 def surf(
     image: NDArray[np.float32],
@@ -48,7 +48,7 @@ def gp_predict_grid(
 ) -> list[NDArray[np.float32]]:
     """Elevation, gradient in x and y, variance and gradient variance, each (rows, cols).
 
-    From xy (N, 2), elevation (N,) and noise (N,); pixel (0, 0) lies at (x, y). RuntimeError where the
+    From xy (N, 2), elevation (N,) and noise (N,); pixel (0, 0) is at (x, y). RuntimeError if the
     equations cannot be solved.
     """
 
@@ -90,7 +90,7 @@ def gp_block_likelihood(
     """
 
 LANES: int
-"""Rotations that the search tries side by side."""
+"""Number of rotations that the search processes side by side."""
 
 def search_spectra(images: NDArray[np.float32], size: int) -> NDArray[np.float32]:
     """Conjugate half spectra of pairs of images (K, 2, n, n), zero beyond n, for the search.
@@ -108,17 +108,17 @@ def search_correlate(
     least_shared: float,
     evident: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Correlations of a turned field and another, at every rotation and every (cyclic) shift.
+    """Correlations of a rotated field and a stored one, at every rotation and every (cyclic) shift.
 
     Parameters
     ----------
     fields, ground : array
-        What `search_spectra` gives for (x, y) and, of half the size, for (known ground, energy) summed over
+        Result of `search_spectra` for (x, y) and, of half the size, for (valid area, energy) summed over
         2 x 2 pixels.
     stored_field, stored_ground : array, (2, n, n / 2 + 1, 2)
-        Half spectra of the other field's x and y, and of its known ground and energy.
+        Half spectra of the stored field's x and y, and of its valid area and energy.
     least_shared : float
-        Pixels that a shift has to share.
+        Number of pixels that a shift has to share.
     evident : float
         r^2 in units of its mean, above which a pose is reported.
 
@@ -142,7 +142,7 @@ def turn_field(
     rows: int,
     cols: int,
 ) -> NDArray[np.float32]:
-    """x, y and known ground (3, rows, cols) of a vector field, through an affine map (3, 3) of pixels."""
+    """x, y and valid area (3, rows, cols) of a vector field, through an affine map (3, 3) of pixels."""
 
 def inlier_counts(
     source: NDArray[np.float64],
@@ -150,7 +150,7 @@ def inlier_counts(
     motions: NDArray[np.float64],
     radius: float,
 ) -> NDArray[np.int32]:
-    """How many of the associations (A, 2) each motion (cos, sin, x, y) (K, 4) brings within the radius."""
+    """Number of associations (A, 2) that each motion (cos, sin, x, y) (K, 4) brings within the radius."""
 
 def settle(
     source: tuple[Any, ...],
@@ -162,8 +162,8 @@ def settle(
     steps: int,
     tolerance: float,
 ) -> tuple[_Array, _Array, _Array, _Array, _Array, _Array, _Array] | None:
-    """The pose that `terrainloop.matching.refine.refine` seeks, and what its `Refinement` holds.
+    """The pose that `terrainloop.matching.refine.refine` seeks, with the data of its `Refinement`.
 
-    A map is (gradient x, gradient y, gradient variance, mask as uint8, origin, resolution). None where
-    too little ground is shared.
+    A map is (gradient x, gradient y, gradient variance, mask as uint8, origin, resolution). None if
+    the overlap is too small.
     """

@@ -1,4 +1,4 @@
-"""The command line: one file a command, all of them in `app`."""
+"""The command line: one file per command, all of them in `app`."""
 
 import errno
 import io
@@ -16,14 +16,14 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def main() -> None:
-    """Run a command and exit: 0 done, 2 bad input, 1 a fault of ours, 128 + its number for a signal."""
+    """Run a command and exit: 0 done, 2 bad input, 1 a fault of terrainloop, 128 + number for a signal."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # what the terminal's encoding lacks is escaped
             stream.reconfigure(errors="backslashreplace")
     interrupt = _Interrupt()
     try:
         try:
-            from terrainloop.cli.app import app  # late: what it imports takes a while, and may be interrupted
+            from terrainloop.cli.app import app  # late: its imports take a while, and may be interrupted
 
             app()
         finally:
@@ -37,13 +37,13 @@ def main() -> None:
 
 
 class _Interrupt:
-    """Turns the first Ctrl-C, SIGTERM or SIGHUP into a KeyboardInterrupt; the second ends the process."""
+    """Raises KeyboardInterrupt on the first Ctrl-C, SIGTERM or SIGHUP; the second ends the process."""
 
     def __init__(self) -> None:
         self.number = 0
         numbers = [getattr(signal, name, None) for name in ("SIGINT", "SIGTERM", "SIGHUP")]
         before = {number: signal.getsignal(number) for number in numbers if number is not None}
-        # What the parent had ignored, as nohup does, stays ignored.
+        # Signals that the parent ignores, as nohup does, stay ignored.
         self._before = {n: handler for n, handler in before.items() if handler is not signal.SIG_IGN}
         for number in self._before:
             signal.signal(number, self)
@@ -68,8 +68,8 @@ def _end_interrupted(error: BaseException, number: int) -> NoReturn:
 
 
 def _end(error: BaseException) -> NoReturn:
-    """Exit with the code of what ended the command, after a line about it."""
-    if isinstance(error, BrokenPipeError):  # who reads the output has seen enough
+    """Exit with the code that the error calls for, after a line about it."""
+    if isinstance(error, BrokenPipeError):  # the reader of the output has closed it
         _drop_output()
         sys.exit(1)
     if isinstance(error, OSError):
@@ -86,7 +86,7 @@ def _end(error: BaseException) -> NoReturn:
 
 
 def _refused(error: OSError) -> TerrainLoopError:
-    """An OSError here is mostly about an output: readers raise errors of their own."""
+    """An OSError here is almost always an unwritable output: readers raise their own errors."""
     named = error.filename is not None
     if error.errno in _FULL:
         mend = "free some space there or write to another disk"
@@ -106,7 +106,7 @@ def _print_line(text: str) -> None:
 
 
 def _drop_output() -> None:
-    """Where stdout cannot be written to, it must not be tried again at exit."""
+    """Discard output that cannot be written, so that Python does not try again at exit."""
     try:
         sys.stdout.flush()
     except OSError:

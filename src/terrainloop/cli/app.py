@@ -1,4 +1,4 @@
-"""``terrainloop``: its commands."""
+"""``terrainloop``: the commands of the program."""
 
 from typing import Annotated
 

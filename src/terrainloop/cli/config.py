@@ -5,7 +5,7 @@ from rich.console import Console
 
 from terrainloop.cli.terminal import Json, PresetOption, Quiet, Terminal, Verbose, read_settings
 
-HELP = "Print the settings as YAML, to be edited and passed on with --config."
+HELP = "Print the settings as YAML, to be edited and passed to --config."
 
 
 def command(

@@ -28,16 +28,18 @@ if TYPE_CHECKING:
     from terrainloop.loop import LoopCandidate
 
 
-HELP = "Simulate a rover mission, find its loop closures, print the table, draw the pictures."
+HELP = "Simulate a rover mission, find its loop closures, compare them with the truth, draw figures."
 
 
 def command(
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for mission and results.")] = Path(
-        "demo"
-    ),
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder for the mission and the results.")
+    ] = Path("demo"),
     world: Annotated[str, typer.Option("--world", help="etna, morocco, mars, flat or ripples.")] = "etna",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed, another place.")] = 0,
-    submaps: Annotated[int, typer.Option("--submaps", min=3, help="How many; 16 have loops.")] = 16,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the terrain and the drive.")] = 0,
+    submaps: Annotated[
+        int, typer.Option("--submaps", min=3, help="Number of submaps; with 16 there are loop closures.")
+    ] = 16,
     max_false_loops: AllowedOption = None,
     workers: WorkersOption = 0,
     as_json: Json = False,
@@ -57,7 +59,7 @@ def command(
     settings = Settings().with_max_false_loops(max_false_loops)
     folder = output / "mission"
     check_folder(folder)
-    written_before(folder)  # refuses before the work
+    written_before(folder)  # refuse before the work is done
     number = worker_count(workers)
     with terminal.progress() as progress:
         simulated = simulate_mission(
@@ -94,12 +96,12 @@ def command(
             for picture, figure in _figures(mission, run, best):
                 save_figure(figure, output / picture)
                 pictures.append(str(output / picture))
-    finally:  # the results are there, whatever becomes of their pictures
+    finally:  # the results are there even if the pictures fail
         terminal.result(summary, show)
 
 
 def _figures(mission: "Mission", run: "Run", best: "LoopCandidate") -> Iterator[tuple[str, "Figure"]]:
-    """The mission with its loops, one gradient map, and the surest match."""
+    """The mission with its loop closures, one gradient map, and the match with the highest score."""
     from terrainloop.report.figures import figure_map, figure_match, figure_mission
 
     assert mission.truth is not None

@@ -1,4 +1,4 @@
-"""``terrainloop detect``: the loops of a mission."""
+"""``terrainloop detect``: the loop closures of a mission."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -40,7 +40,7 @@ def command(
     mission: Annotated[Path, typer.Argument(help="Folder of clouds, one submap per file, in metres.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")],
     all_pairs: Annotated[
-        bool, typer.Option("--all-pairs", help="Compare consecutive submaps too, for evaluation.")
+        bool, typer.Option("--all-pairs", help="Also compare consecutive submaps, for evaluation.")
     ] = False,
     max_false_loops: AllowedOption = None,
     preset: PresetOption = "default",
@@ -120,7 +120,7 @@ def show(console: Console, run: "Run") -> None:
             console.print(f"  left out {printable(f'{record.name}: {record.notes}')}")
     repaired = sum(bool(record.notes) for record in usable)
     if repaired:
-        console.print(f"  {count_of(repaired, 'submap')} repaired on the way in: see notes in submaps.csv")
+        console.print(f"  {count_of(repaired, 'submap')} with repairs or warnings: see notes in submaps.csv")
     console.print(
         f"Written to {printable(str(run.folder))}: loops.csv, pairs.csv (why each was rejected), "
         "submaps.csv, config.yaml, run.json"

@@ -82,7 +82,7 @@ def command(
 
 
 def show(console: Console, evaluation: "Evaluation") -> None:
-    """The result in sentences, then the tables and what they count."""
+    """The result in sentences, then the tables and their meaning."""
     for sentence in _sentences(evaluation):
         console.print(sentence)
     if evaluation.pairs:
@@ -93,7 +93,7 @@ def show(console: Console, evaluation: "Evaluation") -> None:
 
 
 def _sentences(evaluation: "Evaluation") -> list[str]:
-    """The answer first: how many loops are right, what was found, how good the poses are."""
+    """The answer first: right and wrong loops, what was found, errors of the poses."""
     result, tolerance = evaluation.as_dict(), evaluation.tolerance
     left_out = (
         f"{count_of(result['pairs'], 'pair')} evaluated; {result['pairs_left_out']} left out: consecutive "
@@ -204,5 +204,5 @@ def _ratio(value: float, part: int, whole: int) -> str:
 
 
 def _number(value: float, digits: int) -> str:
-    """A number, or a dash where nothing can be claimed."""
+    """A number, or a dash if it is undefined."""
     return "-" if math.isnan(value) else f"{value:.{digits}f}"

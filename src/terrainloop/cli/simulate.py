@@ -8,14 +8,16 @@ import typer
 from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose, check_folder
 from terrainloop.errors import printable
 
-HELP = "Simulate a rover's drive over rough ground: clouds, odometry.tum that drifts, truth.tum."
+HELP = "Simulate a rover's drive over rough ground: clouds, drifting odometry.tum, truth.tum."
 
 
 def command(
     output: Annotated[Path, typer.Option("-o", "--output", help="Mission folder to write.")],
     world: Annotated[str, typer.Option("--world", help="etna, morocco, mars, flat or ripples.")] = "etna",
-    seed: Annotated[int, typer.Option("--seed", help="Another seed, another place and drive.")] = 0,
-    submaps: Annotated[int, typer.Option("--submaps", help="How many; 16 have loops.")] = 16,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the terrain and the drive.")] = 0,
+    submaps: Annotated[
+        int, typer.Option("--submaps", help="Number of submaps; with 16 there are loop closures.")
+    ] = 16,
     sensor: Annotated[str, typer.Option("--sensor", help="stereo or lidar.")] = "stereo",
     as_json: Json = False,
     quiet: Quiet = False,
@@ -26,7 +28,7 @@ def command(
 
     terminal = Terminal.open(as_json, quiet, verbose)
     check_folder(output)
-    written_before(output)  # refuses before the work
+    written_before(output)  # refuse before the work is done
     with terminal.progress() as progress:
         mission = simulate_mission(
             world, seed, submaps, sensor, progress=lambda done, total: progress("submaps", done, total)

@@ -1,4 +1,4 @@
-"""What every command shares: its options, how it prints, its progress bars."""
+"""What all commands share: options, printing, progress bars."""
 
 import json
 import logging
@@ -24,14 +24,15 @@ from terrainloop.resources import usable_workers
 if TYPE_CHECKING:
     from terrainloop.config import Settings
 
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else, on stdout.")]
+Json = Annotated[bool, typer.Option("--json", help="Print only the result, as JSON, on stdout.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 Verbose = Annotated[
-    bool, typer.Option("--verbose", "-v", help="Verbose output: what is fitted and decided on the way.")
+    bool, typer.Option("--verbose", "-v", help="Verbose output: each cloud, its fit and its repairs.")
 ]
-PresetOption = Annotated[str, typer.Option("--preset", help="default, or paper: the pipeline as published.")]
+PresetOption = Annotated[str, typer.Option("--preset", help="default, or paper (the published pipeline).")]
 ConfigOption = Annotated[
-    Path | None, typer.Option("--config", help="YAML settings, see 'terrainloop config'. Excludes --preset.")
+    Path | None,
+    typer.Option("--config", help="YAML settings (see 'terrainloop config'); not together with --preset."),
 ]
 SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of the random number generator.")]
 AllowedOption = Annotated[
@@ -62,14 +63,14 @@ class Terminal:
 
     @classmethod
     def open(cls, as_json: bool, quiet: bool, verbose: bool) -> "Terminal":
-        """Set up logging as the user asked, and return the terminal."""
+        """Set up logging as requested, and return the terminal."""
         level = logging.ERROR if quiet else logging.INFO if verbose else logging.WARNING
         remarks = console_of(sys.stderr)
         logging.basicConfig(level=level, format="%(message)s", handlers=[_Remarks(remarks)], force=True)
         return cls(as_json, quiet, remarks)
 
     def result(self, value: Any, show: Callable[[Console], None]) -> None:
-        """Print the result once: as JSON if asked for, else as `show` does unless quiet."""
+        """Print the result once: as JSON if requested, else by `show` unless quiet."""
         if self.as_json:
             typer.echo(json.dumps(_plain(value), indent=2, allow_nan=False))
         elif not self.quiet:
@@ -92,7 +93,7 @@ class Terminal:
 
 
 def console_of(stream: TextIO) -> Console:
-    """A console that prints text as it is: brackets are no markup, and long lines are not broken."""
+    """A console that prints text as it is: brackets are not markup, and long lines are not broken."""
     return Console(file=stream, highlight=False, markup=False, soft_wrap=True)
 
 
@@ -120,7 +121,7 @@ def _plain(value: Any) -> Any:
 
 
 def table_of(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """A right-aligned table that never cuts a cell: where it is too wide, headers wrap, then it overflows."""
+    """A right-aligned table that never truncates a cell: if too wide, headers wrap, then it overflows."""
     table = Table(title=Text(title), title_justify="left", show_edge=False, pad_edge=False)
     for index, column in enumerate(columns):
         least = max(map(cell_len, [*column.split(), *(row[index] for row in rows)]), default=1)
@@ -133,7 +134,7 @@ def table_of(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) 
 def read_settings(
     preset: str, config: Path | None, seed: int | None, max_false_loops: float | None = None
 ) -> "Settings":
-    """Settings from the options that every detecting command has."""
+    """Settings from the options that all detecting commands share."""
     from terrainloop.config import Settings
 
     if config is not None and preset != "default":
@@ -184,7 +185,7 @@ def _check_writable(path: Path) -> None:
 
 
 def worker_count(workers: int) -> int:
-    """As many as asked for, at most one per core; 0: one per core that this process may use."""
+    """The requested number, at most one per core; 0: one per core that this process may use."""
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return usable_workers(workers or usable)
 

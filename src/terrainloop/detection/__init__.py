@@ -1,1 +1,1 @@
-"""Detection: the database of submaps and the loops found in it."""
+"""Detection: stored submaps, the loop closures found among them, and runs over whole missions."""

@@ -28,12 +28,12 @@ class LoopDetector:
     ----------
     settings : Settings, optional
     max_false_loops : float, optional
-        Expected number of false loop closures per mission; in place of that of the settings.
+        Expected number of false loop closures per mission; overrides the settings.
     parameters : Hyperparameters, optional
-        Of the Gaussian process, where they are known; else fitted as ``settings.map.fit`` says.
+        Hyperparameters of the Gaussian process, if known; otherwise fitted according to ``settings.map.fit``.
     expected_pairs : int, optional
-        Number of pairs that the mission will compare, where it is known: `max_false_loops` is shared among
-        them. Otherwise each query is given less of it than the one before, so that it holds for any number.
+        Number of pairs that the mission will compare, if known: `max_false_loops` is shared among them.
+        Otherwise each query is given less of it than the one before, so that it holds for any number.
     on_pair : callable, optional
         Called with every LoopCandidate as it is decided, rejected ones too; the detector keeps the loops
         only.
@@ -88,7 +88,7 @@ class LoopDetector:
         Parameters
         ----------
         submap : Submap
-            With a name that is not taken; one without a name is given its number.
+            A submap with a name that is not taken; one without a name is named by its number.
 
         Returns
         -------
@@ -129,7 +129,7 @@ class LoopDetector:
                 mend="name each submap differently",
             )
         stored = list(self.entries.values())[: max(0, len(self.entries) - self.settings.skip_recent)]
-        # A mission may go on for ever: its k-th query, which finds k stored, may spend 1 / (k (k + 1)) of
+        # A mission may never end: its k-th query, which finds k stored, may spend 1 / (k (k + 1)) of
         # `max_false_loops`, all queries together 1.
         pairs = self.expected_pairs or len(stored) ** 2 * (len(stored) + 1)
         candidates = compare_many(query, stored, self.settings, pairs=pairs, workers=self.workers)
@@ -171,7 +171,7 @@ def map_submap(
     submap : Submap
     settings : Settings
     parameters : Hyperparameters, optional
-        Of the database; without them they are fitted to this submap.
+        Hyperparameters of the database; fitted to this submap if not given.
     odometry : array, (4, 4), optional
         T_world_submap by odometry.
     workers : int
@@ -199,7 +199,7 @@ def map_submap(
 def map_pair(
     source: Submap, target: Submap, settings: Settings, *, workers: int = 1
 ) -> tuple[MapEntry, MapEntry]:
-    """Two submaps at rest with the same hyperparameters, so that they can be compared."""
+    """Two submaps mapped with the same hyperparameters, so that they can be compared."""
     shared = None
     if settings.map.fit == "database":
         shared = fit_database([source, target], settings, workers=workers)

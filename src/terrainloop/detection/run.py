@@ -1,4 +1,4 @@
-"""A run: what a command leaves in its output folder, written whole or not at all, and read back."""
+"""A run: the content of a command's output folder, written completely or not at all, and read back."""
 
 import errno
 import os
@@ -40,25 +40,25 @@ DERIVED = (
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Loops found among submaps, with all that they depend on.
+    """Loop closures found among submaps, with everything that they depend on.
 
     Attributes
     ----------
     settings : Settings
     parameters : Hyperparameters or None
-        Of the database; None where each submap has its own.
+        Hyperparameters of all maps; None where each submap has its own.
     submaps : tuple of SubmapRecord
         Every submap in order, broken ones too.
     loops : tuple of LoopCandidate
         The accepted ones.
     rejections : mapping of str to int
-        How many pairs were rejected, by the first clause of the reason.
+        Number of rejected pairs, by the first clause of the reason.
     complete : bool
         False where the run was interrupted.
     entries : mapping of str to MapEntry
         The mapped submaps by id; empty where the run was read from a folder.
     folder : Path or None
-        Where it is written.
+        Folder that it was written to or read from.
     """
 
     settings: Settings
@@ -112,7 +112,7 @@ class Run:
         loops = tuple(read_loops(folder / LOOPS))
         if about.loops not in (None, len(loops)):
             raise TerrainLoopError(
-                expected=f"{about.loops} loops in {folder / LOOPS}, as {RUN} has it",
+                expected=f"{about.loops} loops in {folder / LOOPS}, as {RUN} states",
                 found=str(len(loops)),
                 mend="detect again",
             )
@@ -149,10 +149,10 @@ class Tally:
 
 
 class RunWriter:
-    """Writes a run aside while it goes on, and moves it into its folder when it is finished.
+    """Writes a run to a hidden folder while it goes on, and moves it into its own when it is finished.
 
-    Pairs go to disk as they come. What an earlier run left in the folder is replaced when the new one is
-    complete; other files are not touched. Errors of the disk name the folder.
+    Pairs are written as they are decided. What an earlier run left in the folder is replaced when the new one
+    is complete; other files are not touched. Errors of the disk name the folder.
     """
 
     def __init__(self, folder: Path, aside: Path) -> None:
@@ -197,7 +197,7 @@ class RunWriter:
 
 
 class _About(BaseModel):
-    """What no other file of the run holds: run.json. Earlier versions wrote none, or less."""
+    """Content of run.json: what no other file of the run holds. Earlier versions wrote none, or less."""
 
     model_config = ConfigDict(allow_inf_nan=False)
 

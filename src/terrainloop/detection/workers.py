@@ -1,4 +1,4 @@
-"""Processes that share a list of independent tasks, whatever happens to one of them."""
+"""Processes that share a list of independent tasks and survive the failure of one of them."""
 
 import logging
 import os
@@ -25,13 +25,13 @@ def map_in_processes(
     """The results of task(0) ... task(count - 1), in order, from as many processes as there are workers.
 
     Workers end with their parent, however that ends, and when the iterator is closed. A task whose worker
-    dies, for lack of memory say, runs once more, alone; if that worker dies as well, `on_death` gives the
-    result.
+    dies, for example for lack of memory, runs once more, alone; if that worker dies as well, `on_death`
+    provides the result.
 
     Parameters
     ----------
     task : callable
-        Can be pickled, as can its results; raises nothing.
+        Picklable, as are its results; raises nothing.
     count, workers : int
     on_death : callable
 

@@ -77,7 +77,7 @@ class ScoredPair(Protocol):
 
     @property
     def score(self) -> float:
-        """Higher is more certain; minus infinity where the two could not be compared."""
+        """Higher is more certain; minus infinity if the two could not be compared."""
 
     @property
     def T_target_source(self) -> Array:
@@ -94,7 +94,7 @@ class EvaluatedPair(Generic[Pair]):
     Attributes
     ----------
     candidate : ScoredPair
-        As it was given.
+        The pair as it was given.
     query : int
         Index of the later of the two submaps in the mission.
     overlap : float
@@ -147,7 +147,7 @@ def evaluate_pairs(
         Each pair of submaps at most once.
     truth : GroundTruth
     tolerance : Tolerance, optional
-        By default that of `Tolerance.for_submaps`.
+        Default: that of `Tolerance.for_submaps`.
 
     Raises
     ------
@@ -199,7 +199,7 @@ def _check_pairs(pairs: Sequence[ScoredPair], truth: GroundTruth) -> None:
 
 
 def _fault_of(pair: ScoredPair, truth: GroundTruth, seen: set[frozenset[str]]) -> tuple[str, str] | None:
-    """What was expected of a pair and what was found, or None where nothing is wrong."""
+    """What was expected of a pair and what was found, or None if nothing is wrong."""
     T = np.asarray(pair.T_target_source)
     for name in (pair.source, pair.target):
         if name not in truth.index:

@@ -117,7 +117,7 @@ def measure(
     Parameters
     ----------
     scores, is_true, is_right : array_like, (P,)
-        As of `precision_recall`.
+        The parameters of `precision_recall`.
     submaps : array_like, (P, 2)
         Name or number of the two submaps of each pair.
     """

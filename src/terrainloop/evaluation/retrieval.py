@@ -73,7 +73,7 @@ def retrieval(
     scores : array_like, (P,)
         Minus infinity where a pair could not be compared.
     truth : GroundTruth
-        That the pairs were evaluated with.
+        The ground truth that the pairs were evaluated with.
     min_overlap : float
         Intersection over union above which a pair is true.
     observed : bool

@@ -1,4 +1,4 @@
-"""A run of `terrainloop detect` evaluated against ground truth: everything that is reported of it."""
+"""A run of `terrainloop detect` evaluated against ground truth: everything that is reported about it."""
 
 import csv
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ Pairs = Sequence[EvaluatedPair[LoopCandidate]]
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Evaluated pairs of a run, and all that is counted of them.
+    """Evaluated pairs of a run, and everything counted over them.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Evaluation:
     min_overlap : float
         Intersection over union above which a pair is true.
     score_name : {"score", "inliers"}
-        What the run decides by.
+        The quantity by which the run decides.
     scores : array, (P,)
         Its value for each pair; minus infinity where there is no transform to accept.
     left_out : int
@@ -95,12 +95,12 @@ class Evaluation:
 
     @cached_property
     def metrics(self) -> dict[tuple[str, str], Metrics]:
-        """Of each criterion."""
+        """Numbers of the curve of each criterion."""
         return {key: criterion.metrics() for key, criterion in self.criteria.items()}
 
     @cached_property
     def retrieval(self) -> dict[str, Retrieval]:
-        """By overlap."""
+        """Counts of queries and revisits for each overlap."""
         return {
             overlap: retrieval(self.pairs, self.scores, self.truth, self.min_overlap, overlap == "observed")
             for overlap in self.overlaps
@@ -137,7 +137,7 @@ class Evaluation:
         return sum(_overlap(pair, overlap) > self.min_overlap for pair in self.right_loops)
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything that is reported, as JSON has it; NaN where nothing can be claimed."""
+        """Everything that is reported, as in the JSON output; NaN where a number is undefined."""
         return {
             "pairs": len(self.pairs),
             "pairs_left_out": self.left_out,

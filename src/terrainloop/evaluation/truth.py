@@ -1,4 +1,4 @@
-"""Ground truth of a mission: where each submap is, which of them share ground, which revisit a place."""
+"""Ground truth of a mission: where each submap is, which submaps share ground, which revisit a place."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Checks of the numbers that come in, and of the errors that come out of the C++ core."""
+"""Checks of numbers given to the Gaussian process, and of errors raised by the C++ core."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,7 +30,7 @@ def check_max_points(**numbers: int | None) -> None:
 
 
 def check_seed(seed: int) -> None:
-    """Refuse what cannot seed a random number generator, or would give other numbers each time."""
+    """Refuse what cannot seed a random number generator, or would seed it differently each time."""
     if not (isinstance(seed, Integral) and seed >= 0):
         raise TerrainLoopError(
             expected="a whole number of at least 0 as the seed",

@@ -1,4 +1,4 @@
-"""The Gaussian process solved exactly, in float64: the paper's method and the reference for any other.
+"""The exact Gaussian process, in float64: the paper's method and the reference for any other solver.
 
 With training points X, elevations z and A = [K(X, X) + N]^-1, N the diagonal of the points' noise
 squared, at a query x:
@@ -30,11 +30,11 @@ NODES = 30  # along an axis of a tile: they interpolate the kernel to 1e-11
 MAX_TILE = 64  # pixels along an axis of a tile, which bounds memory
 BATCH = 256  # arbitrary points predicted at once, which bounds memory
 ROUNDING = 1e-12
-MAX_POINTS = 20_000  # 3.2 GB a matrix
+MAX_POINTS = 20_000  # 3.2 GB per matrix
 
 
 def check_size(count: int) -> None:
-    """Refuse so many points that their covariance would not fit into memory."""
+    """Refuse more points than a covariance that fits into memory."""
     if count > MAX_POINTS:
         raise TerrainLoopError(
             expected=f"at most {MAX_POINTS} points for the dense process",
@@ -94,7 +94,7 @@ def predict_grid(
     parameters : Hyperparameters
         Length scale and variance; the noise is given by point.
     grid : Grid
-        Of H x W pixels.
+        A grid of H x W pixels.
     workers : int
         Threads; the result does not depend on it.
 

@@ -38,7 +38,7 @@ TRUST_REGION = (1 / 1.5, 3.0)  # factors of the length scale that blocks are goo
 CONVERGED_FACTOR = 1.25  # of the length scale, within which they are at their best
 GRADIENT_TOLERANCE = 0.3  # standard errors from the optimum, where a search ends
 
-PENALTY = 1e25  # turns a line search back
+PENALTY = 1e25  # reverses a line search
 
 Likelihood = Callable[[float, float, float], tuple[float, tuple[float, float, float]]]
 
@@ -192,7 +192,7 @@ def _fit_patches(
 
 
 def _drawn(patches: Sequence[TrainingData], options: FitOptions) -> list[TrainingData]:
-    """Of each patch of a cloud, as many points as its share of a full patch's area has."""
+    """Points drawn from each patch of a cloud, in proportion to its share of a full patch's area."""
     if len(patches) == 1 or options.max_points is None:
         return [patch.drawn(options.max_points, options.seed) for patch in patches]
     shares = [patch.area(PATCH_SIDE / OCCUPANCY_CELLS) / PATCH_SIDE**2 for patch in patches]
@@ -210,9 +210,9 @@ def fit_blocks(
 ) -> Hyperparameters:
     """Most likely hyperparameters from every point, square blocks of ground being taken as independent.
 
-    On a block the prior is held by its principal components, so that the likelihood costs the same for any
-    number of points. Blocks and components suit length scales near the one they were made for: a search
-    begins anew until it ends near where it began.
+    On a block the prior is represented by its principal components, so the cost of the likelihood does not
+    depend on the number of points. Blocks and components suit length scales near the one they were made for:
+    a search begins anew until it ends near where it began.
 
     Parameters
     ----------
@@ -314,7 +314,7 @@ def maximise_likelihood(
 
 
 def _likelihood_or_penalty(log_parameters: Array, data: TrainingData) -> tuple[float, Array]:
-    """The likelihood, or a penalty that turns the line search back where the covariance is singular."""
+    """The likelihood, or a penalty that reverses the line search where the covariance is singular."""
     try:
         return negative_log_likelihood(log_parameters, data.xy, data.elevation, data.relative_noise)
     except TerrainLoopError:

@@ -14,14 +14,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Hyperparameters:
-    """What a Gaussian process over the elevation depends on.
+    """Hyperparameters of a Gaussian process over the elevation.
 
     Attributes
     ----------
     length_scale : float
         Metres.
     variance : float
-        Of the elevation under the prior, metres squared.
+        Variance of the elevation under the prior, metres squared.
     noise : float
         Standard deviation of one measured elevation, metres.
     """
@@ -52,7 +52,7 @@ def factor(query: Array, training: Array, length_scale: float) -> tuple[Array, A
 
 
 def squared_distances(xy: Array) -> Array:
-    """Between all pairs of points (N, 2), as (N, N), metres squared."""
+    """Squared distances (N, N) between all pairs of points (N, 2), metres squared."""
     distances = np.subtract.outer(xy[:, 0], xy[:, 0]) ** 2
     distances += np.subtract.outer(xy[:, 1], xy[:, 1]) ** 2
     return distances

@@ -15,11 +15,11 @@ class Prediction:
     Attributes
     ----------
     elevation : array
-        Metres.
+        Elevation, metres.
     gradient_x, gradient_y : array
         Slope along x and y, dimensionless.
     variance : array
-        Of the elevation, metres squared.
+        Variance of the elevation, metres squared.
     gradient_variance : array
         Mean of the variances of the two gradient components, dimensionless.
     """

@@ -36,7 +36,7 @@ class ElevationProcess:
     data : TrainingData
         The points, and the plane subtracted from them.
     parameters : Hyperparameters
-        Of the process; the noise is the typical one.
+        Hyperparameters of the process; the noise is the typical one.
     noise : array, (N,)
         Standard deviation of each point's elevation, metres.
     solver : str
@@ -160,7 +160,7 @@ class ElevationProcess:
         return field
 
     def memory_for(self, pixels: int) -> float:
-        """About how many bytes the prediction of so many pixels takes, the result of 20 each included."""
+        """Approximate bytes needed to predict this many pixels, including 20 bytes each for the result."""
         count = len(self.data.xy)
         if self.solver == "exact":
             return EXACT_BYTES * count**2 + EXACT_PIXEL_BYTES * pixels
@@ -206,7 +206,7 @@ def _checked(solver: str) -> str:
 
 
 def _check_extent(data: TrainingData, length_scale: float) -> None:
-    """Refuse what would take minutes and gigabytes, most often because of a few stray points."""
+    """Refuse an extent that would take minutes and gigabytes, mostly caused by a few stray points."""
     with np.errstate(over="ignore"):
         squares = np.prod(np.ptp(data.xy, axis=0) / length_scale)
     if not squares <= MAX_LENGTH_SCALES:

@@ -90,7 +90,7 @@ def noise_ratio(
     Three effects are multiplied. In cells of half a length scale the robust scatter about a plane is taken
     and pooled with that of the cells around: it grows where the sensor's noise does. Points further from
     their cell's plane than three standard deviations are raised by the square of the excess: flying pixels
-    raise no spikes. The n points in a square of a quarter of a length scale are raised by sqrt(n), so that
+    cause no spikes. The n points in a square of a quarter of a length scale are raised by sqrt(n), so that
     they count as one: the errors of neighbours are much the same, and do not average out.
 
     Parameters
@@ -102,7 +102,7 @@ def noise_ratio(
     length_scale : float
         Metres.
     noise : float
-        Of the process, metres. A typical scatter below a tenth of it is taken for a tenth: on ground whose
+        Noise of the process, metres. A typical scatter below a tenth of it counts as a tenth: on ground whose
         elevations are quantised, most cells show none at all.
     workers : int
         Threads; the result does not depend on it.

@@ -43,9 +43,9 @@ class TrainingData:
     elevation : array, (N,)
         Residual elevation, zero mean, metres.
     centre : array, (3,)
-        Of the points, in the frame of the cloud, metres.
+        Centre of the points, in the frame of the cloud, metres.
     slope : array, (2,)
-        Of the plane that was subtracted; zero where none was.
+        Slope of the plane that was subtracted; zero if none was.
     relative_noise : array, (N,)
         Noise of each point as a share of the typical one.
     typical_noise : float, optional

@@ -11,7 +11,7 @@ from typing import IO, TextIO, cast
 
 
 def write_whole(path: str | Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Write a binary file beside its place and move it there once it is complete.
+    """Write a binary file under a temporary name and rename it once it is complete.
 
     A symbolic link is followed; a device or a pipe is written to directly.
 
@@ -40,7 +40,7 @@ def write_whole(path: str | Path, write: Callable[[IO[bytes]], object]) -> None:
         raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
     finally:
         if not special:
-            with contextlib.suppress(OSError):  # where its folder is none
+            with contextlib.suppress(OSError):  # where its folder does not exist
                 aside.unlink()
 
 
@@ -48,7 +48,7 @@ def write_whole_text(path: str | Path, write: Callable[[TextIO], object]) -> Non
     """Write a text file in UTF-8 as `write_whole` does; line ends stay as written."""
 
     def encode(file: IO[bytes]) -> None:
-        # Unlike io.TextIOWrapper it keeps nothing back that its finaliser would try to write again.
+        # Unlike io.TextIOWrapper it buffers nothing that its finaliser would try to write again.
         write(cast(TextIO, codecs.getwriter("utf-8")(file)))
 
     write_whole(path, encode)

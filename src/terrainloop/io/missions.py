@@ -1,4 +1,4 @@
-"""Missions: folders of submaps, one cloud per file, with their odometry and truth where known."""
+"""Missions: folders of submaps, one cloud per file, with odometry and ground truth if known."""
 
 import csv
 import logging
@@ -30,7 +30,7 @@ class _IndexError(TerrainLoopError, IndexError):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Mission:
-    """A folder of submaps, read one by one when asked for; iterate to have those that can be read.
+    """A folder of submaps, read one by one on demand; iteration yields those that can be read.
 
     ``mission[0]`` and ``mission[-1]`` read one submap, ``mission[:5]`` those of the first five that can be
     read.
@@ -39,7 +39,7 @@ class Mission:
     ----------
     path : Path
     files : tuple of Path
-        One cloud each, in order.
+        One cloud per file, in order.
     odometry, truth : Trajectory or None
         Poses of the submaps' frames, one for each file.
     """
@@ -78,7 +78,7 @@ class Mission:
         Raises
         ------
         TerrainLoopError
-            Where that file is broken, or there is none (then it is an IndexError, too).
+            If that file is broken, or there is none (then it is an IndexError, too).
         """
         if not -len(self) <= index < len(self):
             raise _IndexError(
@@ -113,7 +113,7 @@ class Mission:
             raise TerrainLoopError(
                 expected=f"clouds that can be read in {self.path}",
                 found=f"{broken} broken ones",
-                mend="see what the warnings say about each",
+                mend="see the warning about each",
             )
 
     def _readable(self, indices: range) -> Iterator[Submap]:
@@ -131,14 +131,14 @@ def load_mission(path: str | Path) -> Mission:
     """Find the clouds and trajectories of a mission folder; the clouds are read later.
 
     The clouds are those in its folder ``clouds`` or, where there is none, those in the folder itself;
-    there ``.txt`` and ``.csv`` files are taken for notes, never for clouds. They are ordered by file
+    there ``.txt`` and ``.csv`` files are treated as notes, never as clouds. They are ordered by file
     name, numbers as numbers (see `terrainloop.io.ordering`). ``odometry`` and ``truth`` are looked for as
     ``.tum``, then as ``.txt``.
 
     Raises
     ------
     TerrainLoopError
-        Where there is no folder, no cloud, no clear order though there are poses, or a trajectory that does
+        If there is no folder, no cloud, no unique order although there are poses, or a trajectory that does
         not fit: another number of poses, frames that are not gravity-aligned, inverse poses.
     """
     if not isinstance(path, str | os.PathLike) or not os.path.isdir(path):  # noqa: PTH112, which raises
@@ -199,7 +199,7 @@ def _check_names(files: list[Path]) -> None:
 
 
 def _side_file(path: Path, name: str) -> Path | None:
-    """The trajectory of that name; also where it is no file, which then is refused."""
+    """The trajectory of that name; also if it is not a regular file, which is then refused."""
     return next((file for s in (".tum", ".txt") if os.path.lexists(file := path / (name + s))), None)
 
 
@@ -209,7 +209,7 @@ def read_sessions(path: Path | str) -> dict[str, str]:
     Raises
     ------
     TerrainLoopError
-        If it cannot be read as that: other columns, a cloud named twice, an empty cell.
+        If it is not such a table: other columns, a cloud named twice, an empty cell.
     """
     path = Path(path)
     lines = _table_lines(path)

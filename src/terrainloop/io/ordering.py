@@ -1,4 +1,4 @@
-"""The order of files by their names, refused where the names leave it open.
+"""The order of files by their names, refused where the names are ambiguous.
 
 Numbers in names are compared as numbers: ``scan_9`` comes before ``scan_10``. That is unambiguous as long
 as every plausible reading of the names yields the same order. Readings that can disagree: ``1.9, 1.10`` are
@@ -60,8 +60,8 @@ def order_of_names(names: Sequence[str], stamps: Sequence[Array] = ()) -> Order:
     names : sequence of str, (N,)
         Stems of files, all different.
     stamps : sequence of array, (N,)
-        Of each trajectory that has one pose for each name in that order. Stamps that are the numbers in the
-        names (seconds, also as seconds and nanoseconds, or milli-, micro- or nanoseconds) decide between
+        Stamps of each trajectory with one pose for each name in that order. Stamps that are the numbers in
+        the names (seconds, also as seconds and nanoseconds, or milli-, micro- or nanoseconds) decide between
         readings.
 
     Raises
@@ -87,7 +87,7 @@ def order_of_names(names: Sequence[str], stamps: Sequence[Array] = ()) -> Order:
 
 
 def _by_name(names: Sequence[str]) -> tuple[Order, str]:
-    """The natural order and, in words, why it may be another; empty where it cannot."""
+    """The natural order and, in words, why another is possible; empty if none is."""
     hyphens = [re.search(_MINUS, name) is not None for name in names]
     minus = f"(?:{_MINUS})?" if any(hyphens) else ""
     sign = "" if all(hyphens) else minus  # a hyphen in every name separates
@@ -105,7 +105,7 @@ def _by_name(names: Sequence[str]) -> tuple[Order, str]:
 
 
 def _readings(names: Sequence[str], sign: str, minus: str, natural: Key) -> Iterator[tuple[str, Key]]:
-    """What else the names may mean."""
+    """Other readings of the names."""
     yield "as version numbers", _key(sign + _INTEGER)
     yield "as negative numbers", _key(minus + f"(?:{_DECIMAL})")
     yield "ignoring case and forms of letters", lambda name: natural(normalize("NFKC", name).casefold())
@@ -187,7 +187,7 @@ def _confirmed(names: Sequence[str], stamps: Array) -> Order | None:
 
 
 def _times(names: Sequence[str]) -> Iterator[tuple[Array, bool]]:
-    """What the last number of each name may be in seconds, and whether it surely is no index."""
+    """The last number of each name as seconds, in each reading, and whether it surely is not an index."""
     found = [re.findall(f"(?:{_MINUS})?" + _COMPOUND, name) for name in names]
     if not all(found):
         return
@@ -202,7 +202,7 @@ def _times(names: Sequence[str]) -> Iterator[tuple[Array, bool]]:
 
 
 def _check_stamps(names: Sequence[str], stamps: Array) -> None:
-    """Refuse stamps that go back, or that are the times in the names but of other names."""
+    """Refuse stamps that decrease, or that equal the times in other names."""
     steps = np.diff(stamps)
     if (steps < 0).any():
         at = int(np.argmax(steps < 0))

@@ -38,7 +38,7 @@ def write_geotiff(
     ----------
     path : Path or str
     bands : mapping of str to array, (H, W)
-        In the order of the file.
+        Images by name, in the order of the file.
     origin : tuple of float
         (x, y) of pixel (0, 0), metres.
     resolution : float
@@ -47,7 +47,7 @@ def write_geotiff(
         Valid pixels; the others become NaN in every band.
     crs : int or str, optional
         Projected coordinate reference system of `origin`: an EPSG code, or WKT. GeoTIFF has no key for
-        WKT, so that it is kept as the citation, which people can read, but programs will not apply.
+        WKT, so it is stored as the citation, which people can read but programs do not apply.
 
     Raises
     ------

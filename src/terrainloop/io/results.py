@@ -30,11 +30,12 @@ def read_submaps(path: str | Path) -> list[SubmapRecord]:
 
 
 class LoopFile:
-    """`loops.csv` or `pairs.csv` in the making: one line per candidate, every digit kept.
+    """`loops.csv` or `pairs.csv`, written one line per candidate with all digits.
 
     The transform is T_target_source as x, y, z (metres), roll, pitch, yaw (radians; Rz Ry Rx). The covariance
-    is the upper triangle, row by row, of the parameters of the transform between the two local origins, which
-    are zero unless a frame's origin is far from its submap. Columns are only ever added, at the end.
+    of the parameters of the transform between the two local origins is stored as its upper triangle, row by
+    row; the origins are zero unless a frame's origin is far from its submap. New columns are only ever added
+    at the end.
     """
 
     def __init__(self, path: Path) -> None:

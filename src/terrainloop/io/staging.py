@@ -1,4 +1,4 @@
-"""Several files of one folder, written aside and moved in together."""
+"""Several files of one folder, written elsewhere first and moved in together."""
 
 import errno
 import os
@@ -18,10 +18,10 @@ except ImportError:  # Windows
 
 @contextmanager
 def staging(folder: Path) -> Iterator[Path]:
-    """A hidden folder inside `folder` for what is to be moved in by `publish`; it is removed at the end.
+    """A hidden folder inside `folder` for files that `publish` will move in; it is removed at the end.
 
-    `folder` is made where it is missing, and removed at the end if nothing was moved in. What a process
-    that was killed left behind is removed.
+    `folder` is created if it is missing, and removed at the end if nothing was moved in. Leftovers of
+    processes that were killed are removed.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def staging(folder: Path) -> Iterator[Path]:
 def publish(aside: Path, folder: Path, names: Iterable[str], stale: Iterable[str | Path]) -> None:
     """Move the files of those names from `aside` into `folder`, after the stale ones there are removed.
 
-    Neither an interrupt nor another process that publishes comes in between.
+    Neither an interrupt nor another process that publishes can intervene.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def publish(aside: Path, folder: Path, names: Iterable[str], stale: Iterable[str
 
 @contextmanager
 def errors_naming(path: Path) -> Iterator[None]:
-    """Errors of the system that name `path`: those of writing name no file, others name one aside."""
+    """Make OSErrors name `path`: those of writing name no file, others name a temporary one."""
     try:
         yield
     except OSError as error:

@@ -26,7 +26,7 @@ _EXPLAINED = np.radians(5.0)  # refused where the quaternions with w first are u
 _SAME = 0.3  # share of a step by which odometry and truth may differ, drift included
 _DIFFERENT = 0.5  # share of a step that neither drift nor slip explains
 _LONGER = 2.0  # path length over that of the inverse poses at which one suspects them to be inverse
-_FEWEST = 4  # poses from which a path is judged
+_FEWEST = 4  # poses that a path needs to be checked
 
 
 def read_submap_poses(path: str | Path, names: Sequence[str]) -> Trajectory:
@@ -35,9 +35,9 @@ def read_submap_poses(path: str | Path, names: Sequence[str]) -> Trajectory:
     Parameters
     ----------
     path : path
-        As `read_trajectory` reads it, one pose for each submap.
+        A trajectory that `read_trajectory` can read, one pose for each submap.
     names : sequence of str, (N,)
-        Of the submaps, in the order of the poses.
+        Names of the submaps, in the order of the poses.
 
     Raises
     ------
@@ -103,13 +103,13 @@ def check_upright(trajectory: Trajectory, path: str | Path) -> None:
 
 
 def check_consistent(trajectory: Trajectory, other: Trajectory | None, path: str | Path) -> None:
-    """Look for inverse poses, T_submap_world: they are as upright as the poses themselves.
+    """Look for inverse poses, T_submap_world, which are as upright as the poses themselves.
 
-    Where another trajectory of the same submaps is known, inverse poses are those whose inverses alone move
-    as the other one does, and are refused; trajectories that move in different ways are reported.
-    Otherwise the path is measured: the origin of the world, as seen from a rover that drives and turns,
-    travels further than the rover. That is reported only, for a rover that circles the origin of the world
-    is an exception; straight drives show nothing.
+    If another trajectory of the same submaps is known, poses of which only the inverses move as the other one
+    does are refused; trajectories that move differently are reported. Otherwise the path is measured: seen
+    from a rover that drives and turns, the origin of the world travels further than the rover. That is only
+    reported, because a rover that circles the origin of the world is an exception; a straight drive gives no
+    indication.
 
     Raises
     ------

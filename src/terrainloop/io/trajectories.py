@@ -32,7 +32,7 @@ class Trajectory:
     stamps : array, (N,)
         Seconds, or indices.
     poses : array, (N, 4, 4)
-        T_world_frame of each, metres.
+        T_world_frame at each stamp, metres.
 
     Raises
     ------
@@ -153,7 +153,7 @@ def _table(path: Path) -> tuple[list[int], Array]:
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Cells of each line that has any, line by line and within bounds: what is no text may never end."""
+    """Cells of each line that has any, line by line and within bounds: lines of binary data may never end."""
     try:
         if path.exists() and not path.is_file():
             raise OSError("not a regular file")  # a pipe would block
@@ -184,7 +184,7 @@ def _floats(path: Path, number: int, cells: list[str], width: int) -> list[float
 
 
 def _number(cell: str) -> float:
-    """NaN where it is none; Python alone reads 1_5 as 15."""
+    """A number, or NaN if the cell is not one; Python alone reads 1_5 as 15."""
     try:
         return np.nan if "_" in cell else float(cell)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Algorithm 1 of Le Gentil et al. (IROS 2020), line by line: the reference that tests hold `ransac` to."""
+"""Algorithm 1 of Le Gentil et al. (IROS 2020), line by line: the reference for tests of `ransac`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -17,7 +17,7 @@ from terrainloop.matching.ssd import compute_ssd
 
 
 def compare_by_inliers(source: MapEntry, target: MapEntry, settings: Settings) -> LoopCandidate:
-    """Algorithm 1, and acceptance where n reaches `min_inliers` and h stays below `max_ssd_ratio`."""
+    """Run Algorithm 1 and accept if n reaches `min_inliers` and the SSD ratio is below `max_ssd_ratio`."""
     associations = associate(source.features, target.features)
     alignment = align(source, target, associations, settings)
     if alignment is None:
@@ -66,7 +66,7 @@ def align(
 
 
 def _precision(overlay: Overlay, alignment: Alignment, associations: Associations) -> PlanarPrecision:
-    """Covariance of the alignment from its inliers, about the middle of the overlap."""
+    """Covariance of the alignment from its inliers, about the centroid of the overlap."""
     matched = transform(alignment.T_target_source, associations.source[alignment.inliers])
     residuals = matched - associations.target[alignment.inliers]
     pivot = (overlay.positions if len(overlay.positions) else matched).mean(axis=0)
@@ -76,7 +76,7 @@ def _precision(overlay: Overlay, alignment: Alignment, associations: Association
 
 
 def _refined(source: MapEntry, target: MapEntry, alignment: Alignment, settings: Settings) -> Alignment:
-    """The alignment at which the maps agree best; as it was, if that is no better."""
+    """The alignment at which the maps agree best, or the given one if that is no better."""
     maps = source.gradient_map, target.gradient_map
     refined = refine(*maps, alignment.T_target_source, settings.calibration)
     if refined is None:

@@ -29,7 +29,7 @@ def associate(source: Features, target: Features) -> Associations:
     Parameters
     ----------
     source, target : Features
-        Of one kind. Distances are L2 for real and Hamming for binary (uint8) descriptors.
+        Both of the same kind. Distances are L2 for real and Hamming for binary (uint8) descriptors.
     """
     if not len(source.positions) or not len(target.positions):
         return Associations(np.empty((0, 2)), np.empty((0, 2)))

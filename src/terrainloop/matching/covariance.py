@@ -4,7 +4,7 @@ import numpy as np
 
 from terrainloop.geometry import Array
 
-MAX_CONDITION = 1e10  # of a normal matrix scaled to unit diagonal
+MAX_CONDITION = 1e10  # largest condition of a normal matrix scaled to unit diagonal
 
 
 def block_covariance(
@@ -15,13 +15,13 @@ def block_covariance(
     Parameters
     ----------
     jacobian : array, (N, P) or (C, N, P)
-        Of the residuals at N positions, C of them at each.
+        Jacobian of the residuals at N positions, C of them at each.
     weighted_residuals : array, (N,) or (C, N)
         Weights times residuals at the optimum.
     normal : array, (P, P)
         Normal matrix J' W J.
     positions : array, (N, 2)
-        Of the residuals, metres.
+        Where the residuals are, metres.
     block : float
         Side of the blocks whose sums count as independent, metres.
 

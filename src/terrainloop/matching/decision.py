@@ -16,25 +16,25 @@ from terrainloop.matching.refine import Refinement, refine
 from terrainloop.matching.significance import log_num_tests
 from terrainloop.matching.ssd import compute_ssd
 
-REJECTED_STEP = 3  # every third row and column is enough to show a rejected pair
+REJECTED_STEP = 3  # every third row and column is enough to describe a rejected pair
 UNKNOWN = np.full((3, 3), np.nan)
 LN_10 = float(np.log(10.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Weighed:
-    """The best hypothesis of a pair among its rivals, and what a loop closure needs.
+    """The best hypothesis of a pair, its rivals, and the evidence that a loop closure needs.
 
     Attributes
     ----------
     best : Hypothesis
-        The most surprising one, of those whose correlation is high enough if there are any.
+        The one with the highest surprisal, among those whose correlation is high enough if there are any.
     rivals : list of Hypothesis
-        All whose correlation is high enough.
+        All hypotheses whose correlation is high enough.
     log_tests : float
         Natural logarithm of the number of tests in this pair.
     needed : float
-        Surprisal at which the expected number of false loops of the run is what is allowed, nats.
+        Surprisal at which the expected number of false loops per run equals the allowed number, nats.
     """
 
     best: Hypothesis
@@ -58,12 +58,12 @@ class Weighed:
 
     @property
     def significant(self) -> bool:
-        """Whether chance yields such a hypothesis in no more than the allowed number of loops."""
+        """Whether no more than the allowed number of false loops is expected at this surprisal."""
         return self.best.surprisal >= self.needed
 
 
 def compare_by_evidence(query: Query, target: MapEntry, settings: Settings, pairs: float) -> LoopCandidate:
-    """Search, propose, refine; take the hypothesis that chance explains least, and decide.
+    """Search, propose, refine; take the hypothesis with the highest surprisal, and decide.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def compare_by_evidence(query: Query, target: MapEntry, settings: Settings, pair
 
 
 def _objection(pair: Pair, weighed: Weighed, refinement: Refinement | None) -> str:
-    """Why the best hypothesis is no loop closure, in words; empty if it is one."""
+    """Why the best hypothesis is not a loop closure, in words; empty if it is."""
     calibration, best = pair.settings.calibration, weighed.best
     if not weighed.significant:
         return "chance explains it"
@@ -116,7 +116,7 @@ def _objection(pair: Pair, weighed: Weighed, refinement: Refinement | None) -> s
 
 
 def _candidate(pair: Pair, weighed: Weighed, refinement: Refinement | None, objection: str) -> LoopCandidate:
-    """The decision and the pose in SE(3): the best hypothesis's, without covariance, where it is no loop."""
+    """The decision and the pose in SE(3); without a covariance where the pair is not a loop closure."""
     best, calibration = weighed.best, pair.settings.calibration
     if refinement is None:
         T = best.T_target_source
@@ -158,7 +158,7 @@ def _reason(weighed: Weighed, objection: str, allowed: float) -> str:
 
 
 def _in_words(exponent: float) -> str:
-    """Ten to a power; nobody needs to know by how much it is below 1e-12."""
+    """Ten to a power as text; below 1e-12 the value is of no interest."""
     if exponent < -12:
         return "below 1e-12"
     return f"{10**exponent:.2g}" if -3 < exponent < 6 else f"1e{exponent:.0f}"

@@ -32,11 +32,11 @@ class Hypothesis:
     T_target_source : array, (3, 3)
         SE(2).
     agreement : Agreement
-        Of the two fields at this pose.
+        How well the two fields agree at this pose.
     surprisal : float
         -ln P(agreement at least this good | unrelated ground) in one test, nats.
     found_by : {"dense", "sparse"}
-        The search of all poses, or the keypoints.
+        What proposed the pose: the search of all poses, or the keypoints.
     """
 
     T_target_source: Array
@@ -47,7 +47,7 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two submaps under comparison, and all that hypotheses about them are weighed with."""
+    """Two submaps under comparison, with everything needed to weigh hypotheses about their relative pose."""
 
     source: MapEntry
     target: MapEntry
@@ -78,7 +78,7 @@ class Pair:
 
     @property
     def length_scale(self) -> float:
-        """The longer one of the two maps, metres."""
+        """The larger length scale of the two maps, metres."""
         return max(self.source_field.length_scale, self.target_field.length_scale)
 
     @property
@@ -124,7 +124,7 @@ class Pair:
 
 
 def propose_hypotheses(pair: Pair) -> list[Hypothesis]:
-    """The best places of the search, and the best of the keypoints' that are not among them, refined."""
+    """The best places of the search, and the best place of the keypoints if it is another, refined."""
     calibration = pair.settings.calibration
     hypotheses = [pair.weigh(T, "dense") for T in pair.found.poses[: calibration.dense_hypotheses]]
     sparse = sorted(
@@ -137,7 +137,7 @@ def propose_hypotheses(pair: Pair) -> list[Hypothesis]:
 
 
 def _poses_of_keypoints(pair: Pair) -> Iterator[Array]:
-    """The poses that most keypoint associations agree with."""
+    """The poses with the most inliers among the keypoint associations."""
     proposed = propose(
         pair.associations,
         iterations=pair.settings.match.iterations,

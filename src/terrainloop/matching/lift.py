@@ -14,7 +14,7 @@ from terrainloop.gradient_map import GradientMap
 from terrainloop.matching.covariance import block_covariance
 from terrainloop.matching.overlay import Overlay
 
-MIN_PIXELS = 10  # that determine a tilt
+MIN_PIXELS = 10  # needed to determine a tilt
 OUTLIER = 3.0  # robust standard deviations beyond which an elevation difference is an outlier
 
 
@@ -27,9 +27,10 @@ class PlanarPrecision:
     pivot : array, (2,)
         Point of the target frame that the covariance refers to, metres; best in the middle of the overlap.
     covariance : array, (3, 3)
-        Of (x, y, yaw) at the pivot, metres and radians.
+        Covariance of (x, y, yaw) at the pivot, metres and radians.
     strain_variance : float
-        Of each submap, where they are not rigid (see `terrainloop.matching.refine.Refinement`).
+        Variance of the strain of each submap; zero if rigid (see
+        `terrainloop.matching.refine.Refinement`).
     """
 
     pivot: Array
@@ -48,7 +49,7 @@ def lift_to_se3(
     Parameters
     ----------
     overlay : Overlay
-        Of the two maps at the alignment.
+        The two maps at the alignment.
     precision : PlanarPrecision
     calibration : Calibration
 
@@ -56,8 +57,8 @@ def lift_to_se3(
     -------
     T_target_source : array, (4, 4)
     covariance : array, (6, 6)
-        Of (x, y, z, roll, pitch, yaw) of the transform between the maps' local origins; NaN where the overlap
-        is too small to determine the tilt.
+        Covariance of (x, y, z, roll, pitch, yaw) of the transform between the maps' local origins; NaN where
+        the overlap is too small to determine the tilt.
     """
     source, target, T_planar = overlay.source, overlay.target, overlay.T_target_source
     pivot = precision.pivot
@@ -115,7 +116,7 @@ def covariance_of_inliers(matched: Array, residuals: Array, floor: float) -> Arr
     Returns
     -------
     array, (3, 3)
-        Of (x, y, yaw) at the pivot.
+        Covariance of (x, y, yaw) at the pivot.
     """
     jacobian = np.zeros((2 * len(matched), 3))
     jacobian[0::2, 0] = jacobian[1::2, 1] = 1.0
@@ -137,7 +138,7 @@ def _reach(gradient_map: GradientMap, position: Array) -> float:
 
 
 def _at_local_origin(covariance: Array, arm: Array, yaw: float) -> Array:
-    """From (x, y, z, w_x, w_y, yaw) at the pivot to (x, y, z, roll, pitch, yaw) of the transform.
+    """Convert the covariance of (x, y, z, w_x, w_y, yaw) at the pivot to (x, y, z, roll, pitch, yaw).
 
     The translation is the pivot minus the arm, which leads there from the source's local origin; a rotation w
     changes the arm by w x arm. Roll and pitch are about the source's axes, w_x and w_y about the target's.

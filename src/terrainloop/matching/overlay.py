@@ -1,4 +1,4 @@
-"""Two maps laid over each other at a pose: the source looked up at the pixels of the target."""
+"""Two maps overlaid at a relative pose: the source interpolated at the pixels of the target."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,7 +30,7 @@ class Overlay:
     T_target_source : array, (3, 3)
         SE(2).
     step : int
-        Every step-th row and column of the target is looked at.
+        Every step-th row and column of the target is used.
     """
 
     source: GradientMap
@@ -40,7 +40,7 @@ class Overlay:
 
     @cached_property
     def shared(self) -> NDArray[np.bool_]:
-        """Where both maps have observed the ground, (rows, columns) of the target."""
+        """Mask (rows, columns), on the target's pixels, of the ground that both maps have observed."""
         both: NDArray[np.bool_] = (self._look_up(self.source.mask.astype(np.float32)) > 0.999) & self._every(
             self.target.mask
         )
@@ -92,7 +92,7 @@ def pixel_lookup(source: _Grid, target: _Grid, T_target_source: Array) -> Array:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How two fields agree at a pose.
+    """How well two fields agree at a pose.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class Agreement:
 
 
 def agreement_at(source: Field, target: Field, T_target_source: Array) -> Agreement:
-    """How two fields agree at a pose.
+    """Measure how well two fields agree at a pose.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ class RotatedField:
     ----------
     field : Field
     poses : array, (K, 3, 3)
-        From metres of the map to pixels of each image.
+        Affine maps from metres of the map to pixels of each image.
     vectors : array, (K, 2, n, n)
         x and y.
     area : array, (K, 2, n / 2, n / 2)

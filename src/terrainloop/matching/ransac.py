@@ -16,8 +16,8 @@ from terrainloop.matching.correspondences import Associations
 from terrainloop.matching.overlay import Overlay
 from terrainloop.matching.ssd import Ssd, compute_ssd
 
-CHUNK = 32  # inlier sets that are made at a time: few are asked for
-MAX_VERIFIED = 200  # largest inlier sets whose h is computed, which bounds the time of a pair
+CHUNK = 32  # inlier sets computed at a time: usually few are needed
+MAX_VERIFIED = 200  # inlier sets, the largest, whose h is computed; bounds the time per pair
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +42,8 @@ def register_by_ransac(
     """The result of `algorithm_1.algorithm_1`: the accepted transform with the most inliers.
 
     The loop of the paper keeps, over all draws, the transform with the most inliers among those
-    whose SSD is acceptable. Here draws are visited by falling inlier count, so that the first
-    acceptable one is that transform and h need not be computed for the rest. To bound the time of a
+    whose SSD is acceptable. Here draws are visited in order of decreasing inlier count, so that the
+    first acceptable one is that transform and h need not be computed for the rest. To bound the time per
     pair, h is computed for at most `MAX_VERIFIED` inlier sets, the largest.
 
     Parameters
@@ -88,7 +88,7 @@ def propose(
     Parameters
     ----------
     associations, iterations, inlier_radius, rng
-        As for `register_by_ransac`.
+        The parameters of `register_by_ransac`.
     """
     if len(associations) < 2:
         return

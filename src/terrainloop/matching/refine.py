@@ -17,7 +17,7 @@ SAMPLES_PER_LENGTH_SCALE = 3  # denser samples are redundant
 
 @dataclass(frozen=True)
 class Effort:
-    """How far a refinement goes.
+    """How much effort a refinement makes.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Refinement:
     positions : array, (N, 2)
         Sample points in the target frame, metres.
     residual, weights : array, (2, N)
-        Of the two components of the gradient.
+        Residuals of the two components of the gradient, and their weights.
     motion : array, (2, N, 5)
         Jacobian of the residual by x, y, yaw about the pivot, and the difference in slope along x and y.
     strain : array, (2, N, 3)
@@ -81,8 +81,8 @@ class Refinement:
     def strain_variance(self) -> float:
         """Variance of the strain of one submap, dimensionless: how far it is from rigid.
 
-        From the strain between the two submaps, less its noise, and a prior. The strain along x and along y
-        has twice the variance of one submap's, the shear once.
+        Estimated from the strain between the two submaps, less its noise, and a prior. The strain along x and
+        along y has twice the variance of one submap's, the shear the same variance.
         """
         strain, covariance = self._fit(np.concatenate([self.motion, self.strain], axis=-1))
         samples = (strain[5:] ** 2 - np.diag(covariance)[5:]) / (2.0, 2.0, 1.0)
@@ -93,7 +93,7 @@ class Refinement:
         return (weight * prior + observed) / (weight + len(samples))
 
     def weakest(self, distance: float) -> tuple[Array, Array]:
-        """The two poses (3, 3) at a distance in metres along the direction that is constrained least."""
+        """The two poses (3, 3) at a distance, in metres, along the least constrained direction."""
         radius = float(np.sqrt(((self.positions - self.pivot) ** 2).sum(axis=1).mean()))
         _, normal = self._solve(self.motion / (1.0, 1.0, radius, 1.0, 1.0))
         slopes = np.linalg.solve(normal[3:, 3:], normal[3:, :3])
@@ -166,7 +166,7 @@ def refine(
 
 
 def _gradients_of(gradient_map: GradientMap) -> tuple[Any, ...]:
-    """As the core reads a map."""
+    """The images of a map in the form that the core expects."""
     images = gradient_map.gradient_x, gradient_map.gradient_y, gradient_map.gradient_variance
     return (
         *(np.ascontiguousarray(image, dtype=np.float32) for image in images),

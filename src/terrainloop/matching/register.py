@@ -29,7 +29,7 @@ def register(
     source_map, target_map : GradientMap
     settings : Settings, optional
     names : tuple of str
-        Of source and target; with the seed they also fix the random draws.
+        Names of source and target; together with the seed they determine the random draws.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def register(
 
 
 def compare(source: MapEntry, target: MapEntry, settings: Settings, *, pairs: float = 1) -> LoopCandidate:
-    """As `register`, for submaps at rest; the parameters are those of `compare_many`."""
+    """As `register`, for stored submaps; the parameters are those of `compare_many`."""
     return compare_many(source, [target], settings, pairs=pairs)[0]
 
 
@@ -85,7 +85,7 @@ def compare_many(
     Returns
     -------
     list of LoopCandidate
-        In the order of the targets.
+        One per target, in their order.
     """
     with ThreadPoolExecutor(workers) as pool:
         if settings.match.decision == "inliers":

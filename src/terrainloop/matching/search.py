@@ -14,14 +14,14 @@ from terrainloop.matching.significance import surprisal_of_correlation
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """What a search found.
+    """The result of a search.
 
     Attributes
     ----------
     poses : list of arrays, (3, 3)
-        T_target_source, SE(2), of distinct places, best first.
+        T_target_source, SE(2), one for each distinct place, best first.
     surprisals : array, (P,)
-        Of these poses (see `terrainloop.matching.significance.surprisal_of_correlation`).
+        Surprisals of these poses (see `terrainloop.matching.significance.surprisal_of_correlation`).
     null_area : array, (K,)
         For each of K rotations, evenly spaced from 0 to 2 pi, the area that counts as one independent
         sample, m^2; NaN where no shift shares enough ground.
@@ -43,7 +43,7 @@ class SearchResult:
 def search(query: Query, target: Field, calibration: Calibration) -> SearchResult:
     """Compare a query with a target at every rotation and at every shift that shares enough ground.
 
-    With f the field of the target and g that of the source, rotated, the correlation at a shift t is
+    With f the field of the target and g the rotated field of the source, the correlation at a shift t is
 
         r(t) = sum_x f(x) . g(x - t) / sqrt(sum_x |f(x)|^2 m_g(x - t)  sum_x m_f(x) |g(x - t)|^2)
 
@@ -56,7 +56,7 @@ def search(query: Query, target: Field, calibration: Calibration) -> SearchResul
     ----------
     query : Query
     target : Field
-        At the spacing of the query's grid.
+        The target's field at the spacing of the query's grid.
     calibration : Calibration
     """
     grid, source = query.grid, query.rotated.field
@@ -97,7 +97,7 @@ def same_place(T: Array, other: Array, source: Field, calibration: Calibration) 
 
 
 def _distinct_peaks(peaks: Array, *, separation: float, rotations: int, arc: float, count: int) -> Array:
-    """The most surprising peaks (4, C), each `separation` pixels from those before.
+    """The peaks (4, C) with the highest surprisal, each at least `separation` pixels from those before.
 
     Peaks (4, N) are surprisal, rotation out of `rotations`, row and column. Sources are rotated about their
     centroid, so that a shift is its displacement; from one rotation to the next ground moves by `arc` pixels.

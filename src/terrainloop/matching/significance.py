@@ -29,7 +29,7 @@ def surprisal_of_correlation(
     correlation_squared : float or array
         r^2; 0 for a negative r.
     samples : float or array
-        n, the shared area in units of the area of one independent sample.
+        Number n of samples: the shared area in units of the area of one independent sample.
     calibration : Calibration
     """
     bounded = np.minimum(correlation_squared, calibration.max_correlation**2)
@@ -48,11 +48,12 @@ def surprisal_of_inliers(inliers: int, associations: int, probability: float) ->
     Parameters
     ----------
     inliers : int
-        n, of independent ones.
+        Number n of independent inliers.
     associations : int
-        M.
+        Number M of all associations.
     probability : float
-        p, that one association agrees by chance: the area within the inlier radius over the observed area.
+        Probability p that one association agrees by chance: the area within the inlier radius over the
+        observed area.
 
     Returns
     -------
@@ -86,7 +87,7 @@ def log_num_tests(tried: float, others: NDArray[np.floating], calibration: Calib
     tried : float
         See `terrainloop.matching.search.SearchResult`.
     others : array, (K,)
-        Surprisals of the places found besides the best, by the correlation's formula, falling.
+        Surprisals, by the correlation's formula, of the places found besides the best, in decreasing order.
     calibration : Calibration
     """
     measured = calibration.tail * others[-1] + np.log(len(others)) if len(others) else 0.0

@@ -40,7 +40,7 @@ _CRITERION_STYLES = {  # thinner over thicker, where curves coincide
 
 
 def figure_map(submap: Submap, gradient_map: GradientMap) -> Figure:
-    """How a cloud becomes a gradient map: cloud, elevation, variance, gx, magnitude (paper, Fig. 3)."""
+    """From a cloud to its gradient map: cloud, elevation, variance, gx, magnitude (paper, Fig. 3)."""
     figure = Figure(figsize=(13, 7.5), layout="constrained")
     figure.suptitle(
         f"{submap.name}: {len(submap):,} points, length scale {gradient_map.parameters.length_scale:.3g} m, "

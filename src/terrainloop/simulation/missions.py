@@ -32,16 +32,16 @@ _CLOUDS_ONLY = set(CLOUD_SUFFIXES) - {".txt", ".csv"}  # which beside the folder
 
 @dataclass(frozen=True)
 class Setup:
-    """A sensor on the rover and how its frames become submaps; metres and degrees.
+    """A sensor on the rover and how submaps are made from its frames; metres and degrees.
 
     Attributes
     ----------
     sensor : StereoCamera or SpinningLidar
-        What looks at the ground.
+        The sensor.
     mast : float
         Height of the sensor above the ground between the wheels.
     pitch_deg : float
-        How far the sensor looks down.
+        Downward pitch of the sensor.
     submap_length, frame_spacing : float
         Distance driven in a submap and between two frames.
     voxel : float
@@ -107,22 +107,22 @@ class SimulatedMission:
     Attributes
     ----------
     world, sensor : str
-        As asked for.
+        Names, as requested.
     seed : int
-        As asked for.
+        Seed, as requested.
     clouds : list of array, (N, 3) float32
         Points of each submap in its frame, in metres.
     odometry : array, (M, 4, 4)
-        T_odometry_submap: poses as dead reckoning has them, gravity-aligned by construction.
+        T_odometry_submap: poses by dead reckoning, gravity-aligned by construction.
     truth : array, (M, 4, 4)
-        T_world_submap: where the frame really is, tilted by the error of the estimated gravity, so that
-        it takes the points onto the terrain up to noise and to the drift since the submap's start.
+        T_world_submap: true poses, tilted by the error of the estimated gravity, so that they take the
+        points onto the terrain up to noise and to the drift since the submap's start.
     terrain : Terrain
         The ground.
     legs : tuple of str
         For each submap "first", "turn", "opposite" or "same", as driven at its middle.
     frames : array, (M, F, 4, 4)
-        T_world_body: where the rover really was at each frame of each submap.
+        T_world_body: true pose of the rover at each frame of each submap.
     """
 
     world: str
@@ -155,11 +155,11 @@ def simulate_mission(
     seed : int
         Not negative.
     submaps : int
-        How many; from about 8 on there are loops, from 16 on in both directions.
+        Number of submaps; from about 8 on there are loops, from 16 on in both directions.
     sensor : str
         "stereo" or "lidar".
     progress : callable, optional
-        Told the number of submaps done and their total after each.
+        Called with the number of finished submaps and their total after each.
 
     Returns
     -------
@@ -237,8 +237,8 @@ def thin(points: Array, voxel: float) -> Array:
 def write_mission(mission: SimulatedMission, path: FilePath | str) -> None:
     """Write a mission folder: ``clouds/*.ply``, ``odometry.tum``, ``truth.tum``, ``simulation.yaml``.
 
-    The first column of the trajectories is the index of the submap. All of it is written or nothing. What an
-    earlier run wrote there is replaced; other files are left alone.
+    The first column of the trajectories is the index of the submap. All of it is written, or nothing. What an
+    earlier run wrote there is replaced; other files are not touched.
 
     Raises
     ------
@@ -288,7 +288,7 @@ def written_before(path: FilePath | str) -> list[FilePath]:
 
 
 def _submaps_of(description: FilePath) -> int:
-    """How many clouds go with a description of ours; none where there is no such file."""
+    """Number of clouds according to our description; none if there is no such file."""
     try:
         content = read_yaml(description)
     except TerrainLoopError:

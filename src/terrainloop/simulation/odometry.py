@@ -1,4 +1,4 @@
-"""What the rover does on the terrain, and what its odometry believes it does."""
+"""The motion of the rover on the terrain, and its estimate by odometry."""
 
 from dataclasses import dataclass
 
@@ -43,7 +43,7 @@ class Drift:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What the odometry makes of a drive of K frames in M submaps.
+    """Odometry of a drive of K frames in M submaps.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Estimate:
     odometry : array, (M, 4, 4)
         T_odometry_submap of each submap.
     truth : array, (M, 4, 4)
-        T_world_submap of each submap: puts its first frame where the rover really was.
+        T_world_submap of each submap: takes its first frame to the true pose of the rover.
     """
 
     local: Array
@@ -75,10 +75,10 @@ def true_poses(terrain: Terrain, path: Path) -> Array:
 
 
 def estimate(true: Array, frames_per_submap: int, drift: Drift, rng: Generator) -> Estimate:
-    """Dead reckoning along true poses T_world_body (K, 4, 4), cut into submaps of so many frames.
+    """Dead reckoning along true poses T_world_body (K, 4, 4), cut into submaps of a given number of frames.
 
     Attitude is observed up to the gravity error, so only position and heading drift. Each step of the
-    rover is turned by the attitude then believed, which makes a submap as a whole tilt by its gravity
+    rover is rotated by the attitude estimated at that time, which tilts a submap as a whole by its gravity
     error. Odometry starts at the true first pose.
     """
     steps = np.linalg.norm(np.diff(true[:, :3, 3], axis=0, prepend=true[:1, :3, 3]), axis=1)
@@ -104,7 +104,7 @@ def estimate(true: Array, frames_per_submap: int, drift: Drift, rng: Generator) 
 
 
 def _levelled(T: Array) -> Array:
-    """The pose with the same position and yaw that stands upright."""
+    """The upright pose with the same position and yaw."""
     x, y, z = T[:3, 3]
     return se3(x, y, z, 0.0, 0.0, yaw_of(T))
 

@@ -126,7 +126,7 @@ def rocks(rng: Generator, grid: Grid, *, abundance: float, limits: tuple[float, 
 
 
 def _add_rocks(rng: Generator, heights: Array, diameters: Array, half_width: int) -> None:
-    """Raise ``heights`` to half-buried, turned, lopsided ellipsoids; all lengths in pixels."""
+    """Raise ``heights`` to half-buried, rotated, lopsided ellipsoids; all lengths in pixels."""
     n = len(diameters)
     centre = rng.uniform(0, len(heights) - 1, (2, n, 1, 1))
     turn, skew_2, skew_3 = rng.uniform(0, 2 * np.pi, (3, n, 1, 1))

@@ -1,6 +1,6 @@
 """A stereo camera and a spinning LiDAR that look at a height field.
 
-Sensor frames: x forward, y left, z up. Both sensors see by casting rays, so what lies behind a rock or
+Sensor frames: x forward, y left, z up. Both sensors see by casting rays, so what is behind a rock or
 a crest is missing, as it is for a rover.
 """
 
@@ -97,10 +97,10 @@ class StereoCamera:
     width, height : int
         Image size in pixels.
     column_step : int
-        Every row, but only every so many-th column is cast: on flat ground rows thin out with the
-        square of the range, columns only with the range.
+        Rays are cast for every row but only every `column_step`-th column: on flat ground rows thin out
+        with the square of the range, columns only with the range.
     focal_length : float
-        In pixels; with 640 columns 457 means 70 deg across.
+        Focal length in pixels; 457 with 640 columns is a field of view of 70 deg.
     baseline : float
         Distance between the two cameras, in metres.
     max_range : float
@@ -136,7 +136,7 @@ class StereoCamera:
         true_disparity = self.focal_length * self.baseline / depth
         disparity = _flying_pixels(true_disparity, rng) + self._disparity_error(true_disparity, rng)
         measured = self.focal_length * self.baseline / np.maximum(disparity, 0.1)
-        # What the left image shows at a column less than the disparity lies outside the right image.
+        # What the left image shows at a column below the disparity is outside the right image.
         unseen = columns < true_disparity
         kept = ~unseen & (measured <= self.max_range) & ~self._blank_areas(rng)
         return measured[kept][:, None] * pixels[kept]
@@ -198,7 +198,7 @@ class SpinningLidar:
     elevations_deg : (float, float)
         Lowest and highest laser.
     azimuth_step_deg : float
-        Turn between two shots.
+        Rotation between two shots.
     max_range : float
         Greatest distance kept, in metres.
     range_noise : float

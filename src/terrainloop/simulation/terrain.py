@@ -1,4 +1,4 @@
-"""Bare terrain as a height field, in four worlds."""
+"""Bare terrain as a height field, in five worlds."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -41,10 +41,10 @@ class Terrain:
         return np.asarray(lower * (1 - y) + upper * y)
 
     def cell_at(self, xy: ArrayLike) -> tuple[NDArray[np.int64], Array, Array]:
-        """The cell between four nodes that world points (..., 2) lie in, or the nearest one.
+        """The cell between four nodes that contains world points (..., 2), or the nearest one.
 
         Returns the node of its low corner, counted along the rows, and how far beyond it along x and y the
-        points lie, 0 to 1.
+        points are, 0 to 1.
         """
         xy = np.asarray(xy, dtype=float)
         rows, columns = self.height.shape
@@ -62,7 +62,7 @@ class Terrain:
         return np.stack([along_x, along_y], axis=-1) / (2 * self.resolution)
 
     def contains(self, xy: ArrayLike) -> NDArray[np.bool_]:
-        """Whether world points (..., 2) lie within the height field."""
+        """Whether world points (..., 2) are within the height field."""
         pixels = (np.asarray(xy, dtype=float) - self.origin) / self.resolution
         upper = np.array(self.height.shape[::-1]) - 1
         return np.asarray(((pixels >= 0) & (pixels <= upper)).all(axis=-1))

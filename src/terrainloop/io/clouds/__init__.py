@@ -40,7 +40,7 @@ def read_cloud(path: str | Path, stamp: float = 0.0) -> Submap:
         refused. Without a header the first three columns are x, y, z. An intensity is read where a column
         is named so.
     stamp : float
-        Of the submap, seconds.
+        Stamp of the submap, seconds.
 
     Returns
     -------
@@ -51,8 +51,8 @@ def read_cloud(path: str | Path, stamp: float = 0.0) -> Submap:
     Raises
     ------
     TerrainLoopError
-        Naming the file, for whatever is wrong with it, be it that a LAS or LAZ file states coordinates in
-        degrees or feet, or that a count in a header differs from what follows.
+        If anything is wrong with the file, which the error names: damage, coordinates of a LAS or LAZ file
+        in degrees or feet, a count in a header that differs from what follows.
     """
     path = Path(path)
     reader = _reader_for(path)
@@ -73,7 +73,7 @@ def read_cloud(path: str | Path, stamp: float = 0.0) -> Submap:
 
 
 def read_crs(path: str | Path) -> int | str | None:
-    """The coordinate reference system that a cloud states, which only LAS and LAZ can.
+    """The coordinate reference system stated in a cloud, which only LAS and LAZ files can do.
 
     Returns
     -------
@@ -105,7 +105,7 @@ def write_cloud(path: str | Path, points: ArrayLike) -> None:
     Raises
     ------
     TerrainLoopError
-        For another suffix, or what are no points (N, 3).
+        If the suffix is another, or the points are not of shape (N, 3).
     OSError
         Naming `path`, where it cannot be written.
     """
@@ -138,7 +138,7 @@ def _damaged(path: Path, error: Exception) -> TerrainLoopError:
     return TerrainLoopError(
         expected=f"a whole {path.suffix} file",
         found=f"{path}: {reason}",
-        mend="export it again: it is damaged, cut short or of another format than its suffix says",
+        mend="export it again: it is damaged, truncated or of another format than its suffix indicates",
     )
 
 

@@ -94,6 +94,6 @@ def _first_three(array: NDArray[Any]) -> Columns:
         raise TerrainLoopError(
             expected="an array of shape (N, 3) or a few columns more, the first three x, y and z",
             found=f"shape {array.shape} of {array.dtype}",
-            mend="store one row per point; a raster of heights is no cloud",
+            mend="store one row per point; a raster of heights is not a cloud",
         )
     return dict(zip("xyz", array.T[:3], strict=True))

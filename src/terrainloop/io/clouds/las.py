@@ -1,4 +1,4 @@
-"""LAS and LAZ by laspy, behind checks of what laspy and lazrs trust."""
+"""LAS and LAZ by laspy, after checks of what laspy and lazrs take on trust."""
 
 import re
 import struct
@@ -57,7 +57,7 @@ def crs_of(path: Path) -> int | str | None:
     """EPSG code where the file states one, else WKT, else None."""
     with _open(path) as reader:
         wkt, keys = _wkt(reader.header), _geo_keys(reader.header)
-    # Its own authority is the last entry of a system, which ends the text or stands before that of heights.
+    # The authority of a system is its last entry, at the end of the text or before the vertical system.
     epsg = r'(?:AUTHORITY\["EPSG",\s*"|ID\["EPSG",\s*)(\d+)"?\s*\]\s*\]\s*(?:$|,\s*VERT)'
     authority = re.search(epsg, wkt)
     if authority:
@@ -79,7 +79,7 @@ def _open(path: Path) -> Any:
 
 
 def _check_header(path: Path) -> None:
-    """Refuse what is no LAS file, and counts of records over which laspy would loop for ever."""
+    """Refuse what is not a LAS file, and record counts on which laspy would loop forever."""
     with path.open("rb") as file:
         header = file.read(104)
     start, records = struct.unpack_from("<II", header, 96)
@@ -138,7 +138,7 @@ def _columns(points: Any) -> dict[str, Any]:
 
 
 def _check_metres(header: Any) -> None:
-    """Refuse what the file itself states to be in degrees, geocentric or in feet."""
+    """Refuse files that state coordinates in degrees, geocentric coordinates or feet."""
     wkt, keys = _wkt(header), _geo_keys(header)
     geographic = re.match(r'\s*(?:COMP\w+\["[^"]*",\s*)?(?:GEOG|GEOC|GEOD)', wkt)
     feet = re.search(r'UNIT\["[^"]*(?:foot|feet)', wkt, re.IGNORECASE)
@@ -160,6 +160,6 @@ def _wkt(header: Any) -> str:
 
 
 def _geo_keys(header: Any) -> dict[int, int]:
-    """Keys of GeoTIFF that hold a number."""
+    """GeoTIFF keys with numeric values."""
     records = header.vlrs.get("GeoKeyDirectoryVlr")
     return {k.id: k.value_offset for r in records[:1] for k in r.geo_keys if k.tiff_tag_location == 0}

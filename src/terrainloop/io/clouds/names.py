@@ -1,4 +1,4 @@
-"""Which columns of a text the lines above it name."""
+"""The columns of a text file, as named by the lines above its numbers."""
 
 import re
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ _MEANINGS = (
     (_WORLD + "z", r"elevations?|elev|heights?|altitudes?|alt"),
     (_DEGREES, r"lat|lon|long|lng|latitude|longitude"),
     *((name, name) for name in INTENSITY),
-    # Not used, but what stands beside them is surely a name, too.
+    # Not used, but they show that the line holds names.
     (
         _OTHER,
         r"[rgb]|red|green|blue|alpha|rgba?|[nvds][xyz]|normal.*|sigma.*|std.*|scalar.*|i|amplitude|range",
@@ -82,7 +82,7 @@ def _columns_in(line: str, width: int, spare: bool) -> dict[str, int] | None:
 
 
 def _cells_in(line: str) -> tuple[list[str], str | None]:
-    """The line split by its own delimiter, and that, None for blanks."""
+    """The line split at its own delimiter, and the delimiter, None for blanks."""
     line = re.sub(r" {2,}", " ", line)
     line = re.sub(r" ([\[({<])", r"\1", line)  # x [m] is one name
     line = re.sub(r"^(?:columns?|fields?|format|header|names?)[ ]?[:=]", "", line, flags=re.IGNORECASE)
@@ -92,7 +92,7 @@ def _cells_in(line: str) -> tuple[list[str], str | None]:
 
 
 def _meaning(cell: str) -> str:
-    """What a name stands for, empty if it is not known; a coordinate not in metres is none of ours."""
+    """The meaning of a name, empty if it is not known; a coordinate in another unit counts as other."""
     match = _NAME.fullmatch(cell.lower()) if len(cell) <= _LONGEST_NAME else None
     if match is None:
         return ""
@@ -103,7 +103,7 @@ def _meaning(cell: str) -> str:
 
 
 def _axes(meanings: Sequence[str]) -> dict[str, int] | None:
-    """Columns of x, y and z if each is there once: so named, or else in other words."""
+    """Columns of x, y and z if each occurs once, under that name or as easting, northing, elevation."""
     for kinds in ((_LOCAL,), (_LOCAL, _WORLD)):
         found = {
             axis: [i for i, m in enumerate(meanings) if m in [k + axis for k in kinds]] for axis in "xyz"

@@ -53,7 +53,7 @@ class _Element:
 
     @property
     def least(self) -> int:
-        """Bytes that one takes at least in binary."""
+        """Smallest number of bytes of one element in binary."""
         return sum(int((p.length or p.type)[1]) for p in self.properties)
 
 

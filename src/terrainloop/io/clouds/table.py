@@ -14,7 +14,7 @@ Columns = Mapping[str, NDArray[Any]]
 
 INTENSITY = ("intensity", "reflectivity", "scalar_intensity")
 WIDEST = 32
-"""Unnamed columns that a cloud can have; what is wider is a raster of heights."""
+"""Largest number of unnamed columns of a cloud; a wider table is a raster of heights."""
 
 LONGEST_HEADER = 1 << 16
 """Bytes of a header in text."""
@@ -36,14 +36,14 @@ _MISSING = re.compile(
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """The columns of a file by name, and in words what was dropped while reading them."""
+    """The columns of a file by name, and a description of what was dropped while reading them."""
 
     columns: Columns
     repairs: tuple[str, ...] = ()
 
 
 def check_points(count: int, size: int) -> None:
-    """Refuse more points than a file of `size` bytes can hold unless it was made to exhaust memory."""
+    """Refuse more points than a file of `size` bytes holds, unless it was made to exhaust memory."""
     if count > max(_ANY_POINTS, _POINTS_PER_BYTE * size):
         raise ValueError(f"{count} points in {size} bytes")
 
@@ -55,7 +55,7 @@ def check_count(announced: int, found: int) -> None:
 
 
 def count_of(word: str) -> int:
-    """A count as headers hold it; `int` would take signs, underscores and other scripts' digits, too."""
+    """A count in a header; `int` would also accept signs, underscores and digits of other scripts."""
     if not _COUNT.fullmatch(word):
         raise ValueError(f"{word!r} instead of a count")
     return int(word)
@@ -74,7 +74,7 @@ def split_header(data: bytes, last: bytes) -> tuple[list[list[str]], int]:
 
 
 def lines_of(text: bytes) -> list[str]:
-    """Lines that are not blank; what is not ASCII is replaced, so that it is never a number."""
+    """Lines that are not blank; non-ASCII bytes are replaced, so they never form a number."""
     lines = text.decode("ascii", "replace").replace("\r", "\n").split("\n")
     return [line for line in map(_strip, lines) if line.strip()]
 
@@ -107,7 +107,7 @@ def is_number(cell: str) -> bool:
 
 
 def is_missing(cell: str) -> bool:
-    """Whether a cell holds what programs write for a value that is not there, or nothing."""
+    """Whether a cell is empty or holds a common marker for a missing value."""
     return _MISSING.fullmatch(cell.strip(" \t\"'")) is not None
 
 
@@ -142,7 +142,7 @@ def columns_in_text(
     """The columns wanted of a cloud, from lines whose fields are (column, NumPy type) by name.
 
     Numbers of a field declared as single precision are rounded to it, so that what it cannot hold is seen;
-    others stay what the text says.
+    others are kept as written.
     """
     wanted = [name for name in fields if name.lower() in ("x", "y", "z", *INTENSITY)]
     table = numbers(lines, [fields[name][0] for name in wanted], width)

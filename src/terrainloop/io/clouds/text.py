@@ -29,7 +29,7 @@ def read_text(path: Path) -> Table:
         return _read(path.read_bytes().removeprefix(_BYTE_ORDER_MARK))
     except ValueError as error:
         raise TerrainLoopError(
-            expected="lines of at least three numbers, x y z, as many in each, after a header line at most",
+            expected="lines of three or more numbers, x y z, as many in each, after at most one header line",
             found=str(error),
             mend="export plain numbers with decimal points, one point per line, and name the columns x, y, z "
             "or leave the header out",
@@ -38,7 +38,7 @@ def read_text(path: Path) -> Table:
 
 def _read(text: bytes) -> Table:
     if b"\0" in text:
-        raise ValueError("bytes that are no text in UTF-8")
+        raise ValueError("bytes that are not text in UTF-8")
     lines = lines_of(text)
     start = next((i for i, line in enumerate(lines) if _is_row(line)), len(lines))
     header, body = lines[:start], without_comments(lines[start:])
@@ -68,7 +68,7 @@ def _delimiter(line: str) -> str | None:
 
 
 def _is_row(line: str) -> bool:
-    """Whether a line is no comment and holds three numbers or more, or marks that they are missing."""
+    """Whether a line is not a comment and holds three or more numbers or markers of missing ones."""
     if is_comment(line):
         return False
     cells = [cell.strip(' "') for cell in cells_of(line, _delimiter(line))]
@@ -79,6 +79,6 @@ def _is_row(line: str) -> bool:
 def _check_unnamed(body: Sequence[str], delimiter: str | None, width: int) -> None:
     """Refuse columns without names of which the first three are surely not x, y and z."""
     if width > WIDEST:
-        raise ValueError(f"{width} numbers a line and no header: a raster of heights")
+        raise ValueError(f"{width} numbers per line and no header: a raster of heights")
     if delimiter == "," and width >= 6 and width % 2 == 0 and not any("." in line for line in body):
         raise ValueError(f"{width} integers between commas, which may be decimal commas, in {body[0]!r}")
