@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import BROKEN, PLACES, STRICT
-from test_workers import MARK, marked_processes, needs_proc, wait_until
+from test_processes import MARK, marked_processes, needs_proc, wait_until
 
 import terrainloop.cli
 import terrainloop.cli.app

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from terrainloop.gp.isolated import isolated_points
 from terrainloop.gradient_map import GradientMap
+from terrainloop.isolated import isolated_points
 
 
 def ground(count=1500, side=8.0, slope=0.0, seed=0):

@@ -5,6 +5,7 @@ import math
 import zipfile
 from dataclasses import dataclass, fields
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,9 @@ from terrainloop.gp.grid import Grid
 from terrainloop.gp.hyperparameters import FIT_POINTS
 from terrainloop.gp.kernel import Array, Hyperparameters
 from terrainloop.gp.process import MAX_LENGTH_SCALES, ElevationProcess, Solver
-from terrainloop.gp.training import TrainingData
+from terrainloop.gp.training import Points, TrainingData
 from terrainloop.io.files import write_whole
 from terrainloop.resources import check_memory, memory_errors
-from terrainloop.submap import Submap
 
 Image = NDArray[np.float32]
 
@@ -152,7 +152,7 @@ class GradientMap(ReadOnlyArrays):
     @classmethod
     def from_points(
         cls,
-        points: ArrayLike | Submap,
+        points: Points,
         length_scale: float | None = None,
         variance: float | None = None,
         noise: float | ArrayLike | None = None,
@@ -174,8 +174,8 @@ class GradientMap(ReadOnlyArrays):
 
         Parameters
         ----------
-        points : array_like, (N, 3), or Submap
-            Gravity-aligned points, metres.
+        points : array_like, (N, 3), Submap, or TrainingData
+            Gravity-aligned points, metres; or what `terrainloop.gp.training.detrend` made of them.
         length_scale, variance : float, optional
             Of the process (see `Hyperparameters`): metres, metres squared. What is not given is fitted
             to this cloud.
@@ -242,6 +242,16 @@ class GradientMap(ReadOnlyArrays):
                 resolution=grid.resolution,
                 parameters=parameters,
             )
+
+    def plot(self) -> Any:
+        """A matplotlib Figure of the elevation, its standard deviation and the gradients.
+
+        Raises
+        ------
+        TerrainLoopError
+            If matplotlib is not installed.
+        """
+        return import_module("terrainloop.report.figures").figure_map(None, self)
 
     @property
     def local_origin(self) -> Array:
