@@ -381,8 +381,9 @@ def test_warnings_are_one_line_each(cli, config, tmp_path):
     code, out, err = cli("map", path, "-o", tmp_path / "map.npz", "--config", config, "--json")
     assert code == 0, err
     assert json.loads(out)["repairs"]
-    (line,) = err.splitlines()
-    assert line.startswith("warning: longlong")
+    lines = err.splitlines()
+    assert len(lines) == 2  # what was repaired, and what is wrong with the map
+    assert all(line.startswith("warning: longlong") for line in lines)
 
 
 # --- JSON

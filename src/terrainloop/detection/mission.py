@@ -102,7 +102,7 @@ def _detect(
     mission: Mission, settings: Settings, on_pair: PairSink, workers: int, on_progress: Progress
 ) -> Run:
     clouds: list[MappedCloud] = []
-    with _repairs_not_logged():
+    with _clouds_not_logged():
         mapping = MissionMapping.of(mission, settings, workers)
         with closing(mapping.clouds(workers)) as mapped:
             for cloud in mapped:
@@ -158,18 +158,20 @@ def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -
 
 
 @contextmanager
-def _repairs_not_logged() -> Generator[None, None, None]:
-    """They are in the records: logged, they would depend on which process read the cloud, and how often."""
+def _clouds_not_logged() -> Generator[None, None, None]:
+    """What is wrong with a cloud is in its record: logged, it would depend on which process read it, how often."""
 
     def never(record: logging.LogRecord) -> bool:
         return False
 
-    of_submaps = logging.getLogger(Submap.__module__)
-    of_submaps.addFilter(never)
+    loggers = [logging.getLogger(part.__module__) for part in (Submap, map_submap)]
+    for each in loggers:
+        each.addFilter(never)
     try:
         yield
     finally:
-        of_submaps.removeFilter(never)
+        for each in loggers:
+            each.removeFilter(never)
 
 
 @dataclass(frozen=True, eq=False)
