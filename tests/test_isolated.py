@@ -44,7 +44,7 @@ def test_strays_are_dropped_and_the_ground_is_mapped(strays, caplog):
 def test_noise_for_each_point_does_not_fit_once_strays_are_dropped():
     cloud = np.r_[[[900.0, 0.0, 0.0]], ground()]
     noise = np.linspace(0.01, 0.02, len(cloud))
-    with pytest.raises(TerrainLoopError, match="1 points having been dropped; drop .* stray"):
+    with pytest.raises(TerrainLoopError, match=r"1 points having been dropped; drop .* stray"):
         GradientMap.from_points(cloud, 0.8, 0.01, noise)
     assert GradientMap.from_points(cloud[1:], 0.8, 0.01, noise[1:]).mask.any()
 

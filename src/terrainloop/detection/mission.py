@@ -159,7 +159,7 @@ def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -
 
 @contextmanager
 def _clouds_not_logged() -> Generator[None, None, None]:
-    """What is wrong with a cloud is in its record: logged, it would depend on which process read it, how often."""
+    """What is wrong with clouds is in their records: logged, it would depend on which process reads them."""
 
     def never(record: logging.LogRecord) -> bool:
         return False
