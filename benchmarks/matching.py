@@ -34,7 +34,7 @@ from threadpoolctl import threadpool_limits
 
 from terrainloop import Settings, Submap
 from terrainloop.detection.detector import fit_database, map_submap
-from terrainloop.detection.mission import _fit_mission
+from terrainloop.detection.mission import MissionMapping
 from terrainloop.evaluation.overlap import world_boxes
 from terrainloop.evaluation.pairs import evaluate_pairs
 from terrainloop.evaluation.summary import OVERLAP_BANDS
@@ -76,9 +76,7 @@ def mapped(folder):
     key = fingerprint(*package(), Path(__file__), folder, settings=EVIDENCE.model_dump())
     cache = CACHE / f"{key[:16]}.pickle"
     if not cache.exists():
-        parameters = _fit_mission(mission, EVIDENCE, 2)
-        submaps = [mission.read(index) for index in range(len(mission))]
-        content = [map_submap(s, EVIDENCE, parameters, workers=2) for s in submaps]
+        content = [cloud.entry for cloud in MissionMapping.of(mission, EVIDENCE, 2).clouds(1)]
         CACHE.mkdir(parents=True, exist_ok=True)
         cache.write_bytes(pickle.dumps(content))
     entries = pickle.loads(cache.read_bytes())

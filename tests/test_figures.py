@@ -94,6 +94,11 @@ def test_map(submap, source, tmp_path):
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 300  # colour maps, not just text
 
 
+def test_a_map_draws_itself(source, tmp_path):
+    image = pictures(source.plot, tmp_path)
+    assert drawn_share(image) > 0.25
+
+
 def test_map_of_unknown_ground(submap, source, tmp_path):
     known = pictures(lambda: figure_map(submap, source), tmp_path)
     veiled = pictures(lambda: figure_map(submap, unknown(source)), tmp_path)

@@ -337,7 +337,6 @@ def no_file(path):
         spoilt(origin=lambda o: o * np.nan),
         spoilt(origin=lambda o: o[:1]),
         spoilt(elevation=lambda e: e[:-1]),
-        spoilt(elevation=lambda e: e.astype(np.float64)),
         spoilt(elevation=lambda e: e[None]),
         spoilt(gradient_x=lambda g: np.where(g == g.max(), np.float32(np.nan), g)),
         spoilt(gradient_y=lambda g: np.where(g == g.max(), np.float32(1e30), g)),

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
-from terrainloop.gp.isolated import isolated_points
+from terrainloop.errors import TerrainLoopError
 from terrainloop.gradient_map import GradientMap
+from terrainloop.isolated import isolated_points
+from terrainloop.record import SubmapRecord
+from terrainloop.submap import Submap
 
 
 def ground(count=1500, side=8.0, slope=0.0, seed=0):
@@ -38,14 +41,22 @@ def test_strays_are_dropped_and_the_ground_is_mapped(strays, caplog):
     np.testing.assert_array_equal(made.mask, clean.mask)
 
 
-def test_the_noise_of_strays_is_dropped_with_them():
+def test_noise_for_each_point_does_not_fit_once_strays_are_dropped():
     cloud = np.r_[[[900.0, 0.0, 0.0]], ground()]
-    noise = np.r_[5.0, np.linspace(0.01, 0.02, len(cloud) - 1)]
-    one, other = (
-        GradientMap.from_points(points, 0.8, 0.01, each)
-        for points, each in ((cloud, noise), (cloud[1:], noise[1:]))
-    )
-    assert one.variance.tobytes() == other.variance.tobytes()
+    noise = np.linspace(0.01, 0.02, len(cloud))
+    with pytest.raises(TerrainLoopError, match=r"1 points having been dropped; drop .* stray"):
+        GradientMap.from_points(cloud, 0.8, 0.01, noise)
+    assert GradientMap.from_points(cloud[1:], 0.8, 0.01, noise[1:]).mask.any()
+
+
+def test_strays_are_no_part_of_the_submap():
+    cloud = np.r_[[[900.0, 0.0, 0.0]], ground()]
+    submap = Submap(cloud, intensity=np.arange(float(len(cloud))))
+    np.testing.assert_array_equal(submap.points, cloud[1:])
+    assert submap.intensity[0] == 1.0
+    assert "dropped 1 of" in submap.repairs[0]
+    assert "(900, 0, 0)" in submap.repairs[0]
+    assert SubmapRecord.of(submap).hull.max() < 100
 
 
 def spinning(seed=0):

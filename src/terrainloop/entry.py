@@ -14,6 +14,7 @@ from terrainloop.errors import TerrainLoopError
 from terrainloop.features import Features, extract_features
 from terrainloop.field import Field, field_of, field_spacing
 from terrainloop.gradient_map import GradientMap
+from terrainloop.io.npz import pack, read_member
 from terrainloop.record import SubmapRecord
 
 _DESCRIPTORS = {"surf": (64, np.float32), "sift": (128, np.float32), "orb": (32, np.uint8)}
@@ -88,9 +89,7 @@ class MapEntry:
         arrays = {"record": _text(json.dumps(record)), "map": _raw(self.gradient_map.to_bytes())}
         for prefix, part in (("features", self.features), ("field", self.field)):
             arrays |= {f"{prefix}.{f.name}": np.asarray(getattr(part, f.name)) for f in fields(part)}
-        buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, **arrays)
-        return buffer.getvalue()
+        return pack(arrays, compress=False)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> "MapEntry":
@@ -105,7 +104,7 @@ class MapEntry:
             with zipfile.ZipFile(io.BytesIO(data)) as file:
 
                 def array(name: str) -> np.ndarray[Any, Any]:
-                    return _array(file, f"{name}.npy")
+                    return read_member(file, name, len(data), kinds="fiuU")
 
                 return cls(
                     _record(array("record").tobytes()),
@@ -121,18 +120,6 @@ class MapEntry:
                 found=" ".join(str(error).split()) or type(error).__name__,
                 mend="store the submap again",
             ) from error
-
-
-def _array(file: zipfile.ZipFile, name: str) -> np.ndarray[Any, Any]:
-    """An array as `numpy.savez` stores it, never larger than the data, whatever its header announces."""
-    if file.getinfo(name).compress_type != zipfile.ZIP_STORED:
-        raise ValueError(f"{name} is compressed")
-    content = io.BytesIO(file.read(name))
-    if np.lib.format.read_magic(content) != (1, 0):
-        raise ValueError(f"{name} has another version")
-    shape, by_columns, dtype = np.lib.format.read_array_header_1_0(content)
-    values = np.frombuffer(content.read(), dtype).copy()
-    return values.reshape(shape, order="F" if by_columns else "C")
 
 
 def _record(data: bytes) -> SubmapRecord:

@@ -3,8 +3,9 @@
 import io
 import math
 import zipfile
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,16 @@ from terrainloop.gp.grid import Grid
 from terrainloop.gp.hyperparameters import FIT_POINTS
 from terrainloop.gp.kernel import Array, Hyperparameters
 from terrainloop.gp.process import MAX_LENGTH_SCALES, ElevationProcess, Solver
-from terrainloop.gp.training import TrainingData
+from terrainloop.gp.training import Points, TrainingData
 from terrainloop.io.files import write_whole
+from terrainloop.io.npz import pack, read_member
 from terrainloop.resources import check_memory, memory_errors
-from terrainloop.submap import Submap
 
 Image = NDArray[np.float32]
 
 PIXELS_PER_LENGTH_SCALE = 6  # keeps the field's interpolation error below its noise
 MAX_PIXELS = 20_000_000
+MAX_BYTES = 4 * MAX_PIXELS + 4096  # of one image as a file holds it
 BYTES_PER_PIXEL = 32  # at the peak, with the magnitude and temporary arrays (tests/test_memory.py)
 FAR = 10.0  # radii of the map, from which its frame's origin is no longer near it
 
@@ -152,7 +154,7 @@ class GradientMap(ReadOnlyArrays):
     @classmethod
     def from_points(
         cls,
-        points: ArrayLike | Submap,
+        points: Points,
         length_scale: float | None = None,
         variance: float | None = None,
         noise: float | ArrayLike | None = None,
@@ -174,8 +176,8 @@ class GradientMap(ReadOnlyArrays):
 
         Parameters
         ----------
-        points : array_like, (N, 3), or Submap
-            Gravity-aligned points, metres.
+        points : array_like, (N, 3), Submap, or TrainingData
+            Gravity-aligned points, metres; or what `terrainloop.gp.training.detrend` made of them.
         length_scale, variance : float, optional
             Of the process (see `Hyperparameters`): metres, metres squared. What is not given is fitted
             to this cloud.
@@ -243,6 +245,16 @@ class GradientMap(ReadOnlyArrays):
                 parameters=parameters,
             )
 
+    def plot(self) -> Any:
+        """A matplotlib Figure of the elevation, its standard deviation and the gradients.
+
+        Raises
+        ------
+        TerrainLoopError
+            If matplotlib is not installed.
+        """
+        return import_module("terrainloop.report.figures").figure_map(None, self)
+
     @property
     def local_origin(self) -> Array:
         """Point (3,) near the map that its loops' covariances refer to, metres.
@@ -260,10 +272,8 @@ class GradientMap(ReadOnlyArrays):
     def to_bytes(self) -> bytes:
         """The map as the bytes of an ``.npz`` file."""
         content: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
-        content |= {"magnitude": self.magnitude, "parameters": np.array(_values(self.parameters))}
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **content)
-        return buffer.getvalue()
+        content |= {"magnitude": self.magnitude, "parameters": astuple(self.parameters)}
+        return pack(content, compress=True)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> "GradientMap":
@@ -277,7 +287,8 @@ class GradientMap(ReadOnlyArrays):
         try:
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
                 content: dict[str, Any] = {
-                    field.name: _read_member(archive, field.name) for field in fields(cls)
+                    field.name: read_member(archive, field.name, MAX_BYTES, kinds="fb")
+                    for field in fields(cls)
                 }
             content["parameters"] = Hyperparameters(*content["parameters"].tolist())
             return cls(**content)
@@ -314,27 +325,6 @@ class GradientMap(ReadOnlyArrays):
             raise TerrainLoopError(
                 expected=f"{error.expected} in {path}", found=error.found, mend=_MAKE_ONE
             ) from error
-
-
-_KINDS = {"mask": "|b1", **dict.fromkeys(("origin", "resolution", "parameters"), "<f8")}  # others: <f4
-
-
-def _read_member(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    """An array of the file, of the one type that it may have, and no larger than announced or allowed."""
-    info = archive.getinfo(f"{name}.npy")
-    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"{name} packed in another way")  # which may unpack to any size at once
-    with archive.open(info) as file:
-        if np.lib.format.read_magic(file) != (1, 0):
-            raise ValueError(f"{name} of another version of NPY")
-        shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-        if dtype != np.dtype(_KINDS.get(name, "<f4")):
-            raise ValueError(f"{name} of {str(dtype)[:60]}")
-        size = math.prod(shape) * dtype.itemsize
-        if size > min(info.file_size, MAX_PIXELS * dtype.itemsize):
-            raise ValueError(f"{name} of shape {str(shape)[:60]} in {info.file_size} bytes")
-        data = file.read(size)
-    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
 
 
 def _require(met: bool | np.bool_, expected: str, found: str) -> None:
@@ -410,7 +400,3 @@ def _check_memory(process: ElevationProcess, grid: Grid, limit: float | None) ->
     pixels = grid.shape[0] * grid.shape[1]
     needed = process.memory_for(pixels) + (BYTES_PER_PIXEL - 20) * pixels
     check_memory(needed, f"a map of {grid.shape[1]} x {grid.shape[0]} pixels", limit)
-
-
-def _values(parameters: Hyperparameters) -> list[float]:
-    return [parameters.length_scale, parameters.variance, parameters.noise]

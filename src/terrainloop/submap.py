@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from terrainloop.arrays import ReadOnlyArrays, read_only
 from terrainloop.errors import TerrainLoopError
+from terrainloop.isolated import isolated_points
 from terrainloop.plausibility import plausibility_warnings
 
 logger = logging.getLogger(__name__)
@@ -78,7 +79,8 @@ class Submap(ReadOnlyArrays):
         points = np.array(given, dtype=np.float64)
         intensity = None if self.intensity is None else _one_a_point(self.intensity, len(points))
         rows, repairs = _usable_rows(points)
-        points = points[rows]
+        rows, strays = _without_strays(points, rows)
+        points, repairs = points[rows], repairs + strays
         _check_count(points, repairs)
         low, high = np.percentile(points, [1, 99], axis=0)
         # Everything below looks at the bulk of the cloud: a few stray points must not decide.
@@ -101,6 +103,16 @@ class Submap(ReadOnlyArrays):
     def __repr__(self) -> str:
         width, depth, height = np.ptp(self.points, axis=0)
         return f"Submap({self.name!r}, {len(self)} points, {width:.4g} x {depth:.4g} x {height:.4g} m)"
+
+
+def _without_strays(points: Array, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], list[str]]:
+    """The rows whose points are not far from all others, and what was dropped."""
+    stray = isolated_points(points[rows, :2]) if len(rows) else np.zeros(0, dtype=bool)
+    if not stray.any():
+        return rows, []
+    x, y, z = points[rows[stray][0]]
+    found = f"far from all others, such as ({x:.6g}, {y:.6g}, {z:.6g})"
+    return rows[~stray], [f"dropped {stray.sum()} of {len(points)} points: {found}"]
 
 
 def _check_label(what: str, label: str) -> None:

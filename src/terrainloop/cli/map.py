@@ -1,5 +1,6 @@
 """``terrainloop map``: one gradient map."""
 
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -51,6 +52,7 @@ def command(
     picture = output.with_suffix(".png")
     if png:
         check_output(picture, (".png",))
+        import_module("terrainloop.report.figures")  # refuses where matplotlib is missing
     submap = read_cloud(cloud)
     with terminal.progress() as progress:
         progress("map", 0, 1)
@@ -77,6 +79,7 @@ def _summary(submap: "Submap", gradient_map: "GradientMap") -> dict[str, Any]:
         "cloud": submap.name,
         "points": len(submap),
         "repairs": list(submap.repairs),
+        "warnings": [*submap.warnings, *gradient_map.warnings],
         "rows": rows,
         "columns": columns,
         "resolution_m": gradient_map.resolution,
@@ -92,7 +95,7 @@ def _show(console: Console, submap: "Submap", gradient_map: "GradientMap", writt
     parameters, (rows, columns) = gradient_map.parameters, gradient_map.mask.shape
     console.print(
         f"{len(submap)} points -> {columns} x {rows} pixels of {gradient_map.resolution:.3g} m, "
-        f"{gradient_map.mask.mean():.0%} known ground\n"
+        f"{gradient_map.mask.mean():.0%} observed\n"
         f"length scale {parameters.length_scale:.3g} m, relief {parameters.variance**0.5:.3g} m, "
         f"noise {parameters.noise:.3g} m\nwritten: {printable(', '.join(written))}"
     )

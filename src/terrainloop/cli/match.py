@@ -56,7 +56,7 @@ def command(
     settings = read_settings(preset, config, seed, max_false_loops)
     if figure is not None:
         check_output(figure, (".png",))
-        import_module("terrainloop.report.figures")
+        import_module("terrainloop.report.figures")  # refuses where matplotlib is missing
     submaps = read_cloud(source), read_cloud(target)
     with terminal.progress() as progress:
         progress("match", 0, 2)

@@ -1,7 +1,7 @@
 """A whole mission at once: maps in parallel processes, then every pair."""
 
 import logging
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -11,16 +11,17 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from terrainloop.config import Settings
-from terrainloop.detection.detector import LoopDetector, PairSink, fit_database, map_submap
+from terrainloop.detection.detector import LoopDetector, PairSink, detrend_submap, fit_database, map_submap
 from terrainloop.detection.run import Run, RunWriter, Tally
 from terrainloop.detection.workers import map_in_processes
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError, printable
 from terrainloop.gp.kernel import Hyperparameters
+from terrainloop.gp.training import TrainingData
 from terrainloop.io.missions import Mission, load_mission
 from terrainloop.loop import LoopCandidate
 from terrainloop.record import SubmapRecord
-from terrainloop.resources import usable_workers
+from terrainloop.resources import available_memory, usable_workers
 from terrainloop.submap import Submap
 
 logger = logging.getLogger(__name__)
@@ -101,9 +102,9 @@ def _detect(
     mission: Mission, settings: Settings, on_pair: PairSink, workers: int, on_progress: Progress
 ) -> Run:
     clouds: list[MappedCloud] = []
-    with _repairs_not_logged():
-        parameters = _fit_mission(mission, settings, workers) if settings.map.fit == "database" else None
-        with closing(_map_clouds(mission, settings, parameters, workers)) as mapped:
+    with _clouds_not_logged():
+        mapping = MissionMapping.of(mission, settings, workers)
+        with closing(mapping.clouds(workers)) as mapped:
             for cloud in mapped:
                 clouds.append(cloud)
                 logger.info("%s", cloud)
@@ -117,7 +118,7 @@ def _detect(
         )
     run = Run(
         settings=settings,
-        parameters=parameters,
+        parameters=mapping.parameters,
         submaps=tuple(cloud.record for cloud in clouds),
         loops=(),
         entries={entry.id: entry for entry in entries},
@@ -157,64 +158,97 @@ def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -
 
 
 @contextmanager
-def _repairs_not_logged() -> Generator[None, None, None]:
-    """They are in the records: logged, they would depend on which process read the cloud, and how often."""
+def _clouds_not_logged() -> Generator[None, None, None]:
+    """What is wrong with clouds is in their records: logged, it would depend on which process reads them."""
 
     def never(record: logging.LogRecord) -> bool:
         return False
 
-    of_submaps = logging.getLogger(Submap.__module__)
-    of_submaps.addFilter(never)
+    loggers = [logging.getLogger(part.__module__) for part in (Submap, map_submap)]
+    for each in loggers:
+        each.addFilter(never)
     try:
         yield
     finally:
-        of_submaps.removeFilter(never)
+        for each in loggers:
+            each.removeFilter(never)
 
 
-def _fit_mission(mission: Mission, settings: Settings, workers: int) -> Hyperparameters | None:
-    """Hyperparameters of a few usable submaps spread over the mission; None if none is usable."""
+@dataclass(frozen=True, eq=False)
+class MissionMapping:
+    """How the clouds of a mission are mapped.
+
+    Attributes
+    ----------
+    mission : Mission
+    settings : Settings
+    parameters : Hyperparameters or None
+        Of all maps; None where each cloud has its own.
+    prepared : mapping of int to (Submap, TrainingData)
+        The clouds that the parameters were fitted on, by index: they are not read again.
+    max_memory : float
+        Bytes that one map may take.
+    """
+
+    mission: Mission
+    settings: Settings
+    parameters: Hyperparameters | None
+    prepared: Mapping[int, tuple[Submap, TrainingData]]
+    max_memory: float
+
+    @classmethod
+    def of(cls, mission: Mission, settings: Settings, workers: int) -> "MissionMapping":
+        """Fit the hyperparameters of a database on a few usable clouds spread over the mission."""
+        parameters, prepared = None, {}
+        if settings.map.fit == "database" and (prepared := _some_clouds(mission, settings)):
+            parameters = fit_database([data for _, data in prepared.values()], settings, workers=workers)
+            logger.info(
+                "fitted on %s: length scale %.3g m, relief %.3g m, noise %.3g m",
+                ", ".join(submap.name for submap, _ in prepared.values()),
+                parameters.length_scale,
+                parameters.variance**0.5,
+                parameters.noise,
+            )
+        return cls(mission, settings, parameters, prepared, available_memory() / workers)
+
+    def clouds(self, workers: int) -> Generator[MappedCloud, None, None]:
+        """Every cloud of the mission in order, mapped in as many processes as there are workers."""
+        return map_in_processes(self.cloud, len(self.mission), workers, partial(_killed, self.mission))
+
+    def cloud(self, index: int) -> MappedCloud:
+        """A cloud and its map; whatever is wrong with it, the mission goes on without it."""
+        mission = self.mission
+        try:
+            submap, data = self.prepared.get(index) or (mission.read(index), None)
+            entry = map_submap(
+                submap,
+                self.settings,
+                self.parameters,
+                data=data,
+                odometry=None if mission.odometry is None else mission.odometry.poses[index],
+                max_memory=self.max_memory,
+            )
+            return MappedCloud(entry.record, entry)
+        except TerrainLoopError as error:
+            return _broken(mission, index, str(error))
+        except MemoryError:
+            return _broken(
+                mission, index, "not enough memory for its map: use fewer workers, or cut the cloud"
+            )
+        except Exception as error:  # not even a fault of ours may end a mission of hours
+            return _broken(mission, index, f"a fault of terrainloop, please report it: {error!r:.300}")
+
+
+def _some_clouds(mission: Mission, settings: Settings) -> dict[int, tuple[Submap, TrainingData]]:
+    """A few usable clouds spread over the mission, and what the Gaussian process sees of them."""
     spread = np.linspace(0, len(mission) - 1, FITTED_SUBMAPS + 2).astype(int)[1:-1].tolist()
-    submaps: list[Submap] = []
+    clouds: dict[int, tuple[Submap, TrainingData]] = {}
     for index in dict.fromkeys([*spread, *range(len(mission))]):
-        if len(submaps) < FITTED_SUBMAPS:
+        if len(clouds) < FITTED_SUBMAPS:
             with suppress(TerrainLoopError):
-                submaps.append(mission.read(index))
-    if not submaps:
-        return None
-    parameters = fit_database(submaps, settings, workers=workers)
-    logger.info(
-        "fitted on %s: length scale %.3g m, relief %.3g m, noise %.3g m",
-        ", ".join(submap.name for submap in submaps),
-        parameters.length_scale,
-        parameters.variance**0.5,
-        parameters.noise,
-    )
-    return parameters
-
-
-def _map_clouds(
-    mission: Mission, settings: Settings, parameters: Hyperparameters | None, workers: int
-) -> Generator[MappedCloud, None, None]:
-    """Every cloud of the mission in order, mapped in as many processes as there are workers."""
-    task = partial(_map_cloud, mission, settings, parameters)
-    return map_in_processes(task, len(mission), workers, partial(_killed, mission))
-
-
-def _map_cloud(
-    mission: Mission, settings: Settings, parameters: Hyperparameters | None, index: int
-) -> MappedCloud:
-    """A cloud and its map; whatever is wrong with it, the mission goes on without it."""
-    try:
-        submap = mission.read(index)
-        odometry = None if mission.odometry is None else mission.odometry.poses[index]
-        entry = map_submap(submap, settings, parameters, odometry=odometry)
-        return MappedCloud(entry.record, entry)
-    except TerrainLoopError as error:
-        return _broken(mission, index, str(error))
-    except MemoryError:
-        return _broken(mission, index, "not enough memory for its map: use fewer workers, or cut the cloud")
-    except Exception as error:  # not even a fault of ours may end a mission of hours
-        return _broken(mission, index, f"a fault of terrainloop, please report it: {error!r:.300}")
+                submap = mission.read(index)
+                clouds[index] = submap, detrend_submap(submap, settings)
+    return clouds
 
 
 def _killed(mission: Mission, index: int) -> MappedCloud:

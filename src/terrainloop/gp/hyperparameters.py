@@ -6,7 +6,6 @@ from dataclasses import astuple, dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.linalg import cho_solve
 from scipy.optimize import Bounds, minimize
 from threadpoolctl import threadpool_limits
@@ -16,9 +15,9 @@ from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.checks import check_max_points, check_positive, check_seed, core_errors
 from terrainloop.gp.exact import check_size, factorise, invert
 from terrainloop.gp.kernel import Array, Hyperparameters, squared_distances
-from terrainloop.gp.training import OCCUPANCY_CELLS, PATCH_SIDE, TrainingData, detrend
+from terrainloop.gp.training import OCCUPANCY_CELLS, PATCH_SIDE, Points, TrainingData, detrend
 from terrainloop.resources import usable_workers
-from terrainloop.submap import MIN_POINTS, Submap
+from terrainloop.submap import MIN_POINTS
 
 # How far each hyperparameter may move from its start, as a factor. A length scale far below the
 # spacing of the points would only turn the terrain into noise.
@@ -92,7 +91,7 @@ class FitOptions:
 
 
 def fit_hyperparameters(
-    clouds: Sequence[ArrayLike | Submap],
+    clouds: Sequence[Points],
     length_scale: float | None = None,
     variance: float | None = None,
     noise: float | None = None,

@@ -13,8 +13,7 @@ from terrainloop.gp.grid import Grid
 from terrainloop.gp.hyperparameters import FIT_POINTS, FitOptions, fit_training_data
 from terrainloop.gp.kernel import Array, Hyperparameters
 from terrainloop.gp.prediction import Prediction
-from terrainloop.gp.training import TrainingData, detrend
-from terrainloop.submap import Submap
+from terrainloop.gp.training import Points, TrainingData, detrend
 
 Solver = Literal["spline", "exact"]
 
@@ -59,7 +58,7 @@ class ElevationProcess:
     @classmethod
     def from_points(
         cls,
-        points: ArrayLike | Submap,
+        points: Points,
         length_scale: float | None = None,
         variance: float | None = None,
         noise: float | ArrayLike | None = None,

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrainloop.errors import TerrainLoopError
-from terrainloop.gp.isolated import isolated_points
 from terrainloop.gp.kernel import Array, Hyperparameters
 from terrainloop.submap import MIN_POINTS, Submap
 
@@ -152,27 +151,22 @@ class TrainingData:
         )
 
 
-def detrend(
-    points: ArrayLike | Submap, *, remove_plane: bool = True, noise: ArrayLike | None = None
-) -> TrainingData:
-    """Refer points (N, 3) to their centre and plane; stray points (see `isolated_points`) are dropped.
+Points = ArrayLike | Submap | TrainingData
+
+
+def detrend(points: Points, *, remove_plane: bool = True, noise: ArrayLike | None = None) -> TrainingData:
+    """Refer points (N, 3) to their centre and plane; what is detrended already stays as it is.
 
     Raises
     ------
     TerrainLoopError
         If the points do not make a submap (see `Submap`), or the noise (N,) is not one number for each.
     """
+    if isinstance(points, TrainingData):
+        return points
     submap = points if isinstance(points, Submap) else Submap(np.asarray(points))
     each = None if noise is None else _checked_noise(noise, points, submap)
     cloud = submap.points
-    stray = isolated_points(cloud[:, :2])
-    if stray.any():
-        found = cloud[stray][0]
-        logger.warning(
-            "%s: dropped %d of %d points: far from all others, such as (%.6g, %.6g, %.6g)",
-            *(submap.name, stray.sum(), len(stray), *found),
-        )
-        cloud, each = cloud[~stray], None if each is None else each[~stray]
     typical = None if each is None else float(np.median(each))
     relative = np.ones(len(cloud)) if each is None or typical is None else each / typical
     whole = TrainingData(cloud[:, :2], cloud[:, 2], np.zeros(3), np.zeros(2), relative, typical)
@@ -192,6 +186,6 @@ def _checked_noise(noise: ArrayLike, points: ArrayLike | Submap, submap: Submap)
         raise TerrainLoopError(
             expected=f"one positive noise for each of the {len(submap)} points, in metres",
             found=f"shape {given.shape}" + (f", {dropped} points having been dropped" if dropped else ""),
-            mend="drop repeated and non-finite points first, or give one number",
+            mend="drop repeated, stray and non-finite points first, or give one number",
         )
     return given

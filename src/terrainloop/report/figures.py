@@ -39,21 +39,24 @@ _CRITERION_STYLES = {  # thinner over thicker, where curves coincide
 }
 
 
-def figure_map(submap: Submap, gradient_map: GradientMap) -> Figure:
-    """From a cloud to its gradient map: cloud, elevation, variance, gx, magnitude (paper, Fig. 3)."""
+def figure_map(submap: Submap | None, gradient_map: GradientMap) -> Figure:
+    """From a cloud to its gradient map: cloud, elevation, deviation, gradients (paper, Fig. 3).
+
+    Without the cloud, the first panel shows the observed area.
+    """
     figure = Figure(figsize=(13, 7.5), layout="constrained")
+    cloud = "" if submap is None else f"{submap.name}: {len(submap):,} points, "
     figure.suptitle(
-        f"{submap.name}: {len(submap):,} points, length scale {gradient_map.parameters.length_scale:.3g} m, "
+        f"{cloud}length scale {gradient_map.parameters.length_scale:.3g} m, "
         f"{gradient_map.resolution:.3g} m per pixel",
         parse_math=False,  # here and below: names may hold dollars
     )
     first = figure.add_subplot(2, 3, 1)
-    drawn = submap.points[:: max(1, len(submap) // DRAWN_POINTS)]
-    low, high = np.percentile(drawn[:, 2], [0.5, 99.5])  # a flying pixel must not take the colours
-    heights: dict[str, Any] = {"c": drawn[:, 2], "cmap": "gist_earth", "vmin": low, "vmax": high}
-    dots = first.scatter(drawn[:, 0], drawn[:, 1], s=0.3, linewidths=0, **heights)
-    _finish(first, "(a) point cloud, height")
-    figure.colorbar(dots, ax=first, label="m")
+    if submap is None:
+        first.imshow(gradient_map.mask, origin="lower", extent=gradient_map.extent, cmap="gray", vmin=-1)
+        _finish(first, "(a) observed area")
+    else:
+        _draw_cloud(figure, first, submap)
     steep = _steepest(gradient_map)
     panels: list[tuple[str, NDArray[np.float32], str, str, dict[str, Any]]] = [
         ("(b) elevation", gradient_map.elevation, "gist_earth", "m", {}),
@@ -64,12 +67,21 @@ def figure_map(submap: Submap, gradient_map: GradientMap) -> Figure:
     ]
     for place, (title, image, colours, unit, limits) in enumerate(panels, start=2):
         axes = figure.add_subplot(2, 3, place)
-        shown = axes.imshow(image, origin="lower", extent=_extent(gradient_map), cmap=colours, **limits)
+        shown = axes.imshow(image, origin="lower", extent=gradient_map.extent, cmap=colours, **limits)
         if place > 3:
             _veil(axes, gradient_map)
         _finish(axes, title)
         figure.colorbar(shown, ax=axes, label=unit)
     return figure
+
+
+def _draw_cloud(figure: Figure, axes: Axes, submap: Submap) -> None:
+    drawn = submap.points[:: max(1, len(submap) // DRAWN_POINTS)]
+    low, high = np.percentile(drawn[:, 2], [0.5, 99.5])  # a flying pixel must not take the colours
+    heights: dict[str, Any] = {"c": drawn[:, 2], "cmap": "gist_earth", "vmin": low, "vmax": high}
+    dots = axes.scatter(drawn[:, 0], drawn[:, 1], s=0.3, linewidths=0, **heights)
+    _finish(axes, "(a) point cloud, height")
+    figure.colorbar(dots, ax=axes, label="m")
 
 
 def figure_match(source: MapEntry, target: MapEntry, candidate: LoopCandidate, settings: Settings) -> Figure:
@@ -216,22 +228,17 @@ def _steepest(gradient_map: GradientMap) -> float:
     return (float(np.percentile(known, 99)) if known.size else 0.0) or 1.0
 
 
-def _extent(gradient_map: GradientMap) -> tuple[float, float, float, float]:
-    (x, y), r, (rows, columns) = gradient_map.origin, gradient_map.resolution, gradient_map.mask.shape
-    return x - r / 2, x + r * (columns - 0.5), y - r / 2, y + r * (rows - 0.5)
-
-
 def _veil(axes: Axes, gradient_map: GradientMap) -> None:
     """Cover the ground that is not known with white."""
     veil = np.ones((*gradient_map.mask.shape, 4))
     veil[..., 3] = np.where(gradient_map.mask, 0.0, 0.85)
-    axes.imshow(veil, origin="lower", extent=_extent(gradient_map))
+    axes.imshow(veil, origin="lower", extent=gradient_map.extent)
 
 
 def _show_magnitude(axes: Axes, gradient_map: GradientMap) -> None:
     steep = _steepest(gradient_map)
     axes.imshow(
-        gradient_map.magnitude, origin="lower", extent=_extent(gradient_map), cmap="gray", vmin=0, vmax=steep
+        gradient_map.magnitude, origin="lower", extent=gradient_map.extent, cmap="gray", vmin=0, vmax=steep
     )
     _veil(axes, gradient_map)
 
@@ -262,7 +269,7 @@ def _show_overlay(axes: Axes, overlay: Overlay) -> None:
     image = np.ones((*overlay.shared.shape, 3))
     image[overlay.shared, 0] = np.clip(overlay.of_source(overlay.source.magnitude) / steep, 0, 1)
     image[overlay.shared, 1:] = np.clip(overlay.of_target(target.magnitude) / steep, 0, 1)[:, None]
-    axes.imshow(image, origin="lower", extent=_extent(target))
+    axes.imshow(image, origin="lower", extent=target.extent)
     _finish(axes, "aligned overlap: grey agrees, red source only, cyan target only")
 
 

@@ -2,13 +2,13 @@
 
 import zipfile
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.io.clouds.table import INTENSITY, WIDEST, Columns, Table
+from terrainloop.io.npz import read_array, read_header, read_member
 
 _ANY_BYTES = 1 << 26  # that a member of an archive may unpack to however small it is ...
 _BYTES_PER_BYTE = 20  # ... and for each byte that it takes packed
@@ -17,7 +17,7 @@ _BYTES_PER_BYTE = 20  # ... and for each byte that it takes packed
 def read_npy(path: Path) -> Table:
     """Read an array (N, 3 or more): x, y, z first."""
     with path.open("rb") as file:
-        array = _load(file, path.stat().st_size)
+        array = read_array(file, path.stat().st_size)
     return Table(_first_three(array))
 
 
@@ -27,12 +27,11 @@ def read_npz(path: Path) -> Table:
         members = _members(archive)
 
         def load(name: str) -> NDArray[Any]:
-            with archive.open(members[name]) as file:
-                return _load(file, members[name].file_size)
+            return read_member(archive, name, members[name])
 
         def is_table(name: str) -> bool:
-            with archive.open(members[name]) as file:
-                return len(_header(file).shape) == 2
+            with archive.open(f"{name}.npy") as file:
+                return len(read_header(file).shape) == 2
 
         if "points" in members:
             columns = _first_three(load("points"))
@@ -46,46 +45,16 @@ def read_npz(path: Path) -> Table:
         return Table({**columns, **{name: load(name) for name in INTENSITY if name in members}})
 
 
-def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """Arrays by name, none of which takes much more memory than the file."""
+def _members(archive: zipfile.ZipFile) -> dict[str, int]:
+    """Arrays by name, and the bytes that each may take: not much more than the file."""
     arrays = [member for member in archive.infolist() if member.filename.endswith(".npy")]
-    members = {member.filename.removesuffix(".npy"): member for member in arrays}
-    if len(members) < len(arrays):
+    limits = {
+        member.filename.removesuffix(".npy"): max(_ANY_BYTES, _BYTES_PER_BYTE * member.compress_size)
+        for member in arrays
+    }
+    if len(limits) < len(arrays):
         raise ValueError("two arrays of one name")
-    for name, member in members.items():
-        # zipfile unpacks BZIP2 and LZMA without bound, and NumPy writes neither.
-        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ValueError(f"the array {name!r} is packed by another method than NumPy's")
-        if member.file_size > max(_ANY_BYTES, _BYTES_PER_BYTE * member.compress_size):
-            raise ValueError(f"{member.file_size} bytes packed in {member.compress_size}")
-    return members
-
-
-class _Header(NamedTuple):
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-
-
-def _header(file: IO[bytes]) -> _Header:
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    version = np.lib.format.read_magic(file)
-    if version not in readers:  # 3.0 is for structured types alone
-        raise ValueError(f"an NPY file of version {version}")
-    shape, _, dtype = readers[version](file)
-    return _Header(shape, dtype)
-
-
-def _load(file: IO[bytes], size: int) -> NDArray[Any]:
-    """The array of an NPY stream of `size` bytes; its type and size are checked before it is read."""
-    shape, dtype = _header(file)
-    if dtype.kind not in "fiu":
-        raise ValueError(f"an array of {'objects, which are never loaded' if dtype.hasobject else dtype}")
-    announced = file.tell() + int(np.prod(shape, dtype=object)) * dtype.itemsize
-    if announced != size:
-        raise ValueError(f"an array of shape {shape} of {dtype} announced, {size} bytes in all")
-    file.seek(0)
-    array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
-    return array
+    return limits
 
 
 def _first_three(array: NDArray[Any]) -> Columns:

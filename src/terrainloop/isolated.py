@@ -6,7 +6,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from terrainloop.gp.kernel import Array
+Array = NDArray[np.float64]
 
 CENTRAL = (10, 90)  # percentiles of the coordinates between which the bulk of a cloud is found
 CELL = 0.25  # side of a cell, as a share of the bulk's; cells that touch are one piece of ground
