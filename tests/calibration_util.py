@@ -134,9 +134,7 @@ def with_field(entry, settings):
 
 def search_settings(settings):
     """The settings whose searches can be used: the default's, unless a constant of the search differs."""
-    changed = {
-        name for name, value in settings.calibration if value != getattr(Settings().calibration, name)
-    }
+    changed = {name for name, value in settings.calibration if value != getattr(Settings().calibration, name)}
     return Settings() if changed <= AFTER_SEARCH else settings
 
 
@@ -247,7 +245,7 @@ def normalised(errors, part):
 def of_errors(settings):
     """NEES over its degrees of freedom, and the share within 95 %, of submaps whose odometry drifts."""
     errors = [closure.error(settings.calibration) for closure in closures(*DRIFTING)]
-    parts = {"all": [0, 1, 2, 3, 4, 5], "x, y": [0, 1], "roll, pitch": [3, 4], "yaw": [5]}
+    parts = {"all": [0, 1, 2, 3, 4, 5], "x, y": [0, 1], "z": [2], "roll, pitch": [3, 4], "yaw": [5]}
     nees = {f"NEES of {name}": normalised(errors, p).mean() / len(p) for name, p in parts.items()}
     return nees | {"within 95 %": np.mean(normalised(errors, parts["all"]) < chi2.ppf(0.95, 6))}
 
