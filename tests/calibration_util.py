@@ -79,10 +79,10 @@ class Drive:
         overlap = box_iou(world_boxes([entry.record.hull for entry in entries], truth))
         return cls(entries, truth, overlap)
 
-    @property
-    def revisits(self):
-        """Pairs (source, target) that share more than a tenth of their ground and are not consecutive."""
-        return [(self.entries[i], self.entries[j]) for i, j in np.argwhere(np.tril(self.overlap > 0.1, -2))]
+    def revisits(self, most):
+        """Pairs (source, target) that are not consecutive and share more than a tenth, up to `most`."""
+        chosen = (self.overlap > 0.1) & (self.overlap <= most)
+        return [(self.entries[i], self.entries[j]) for i, j in np.argwhere(np.tril(chosen, -2))]
 
     def true_pose(self, candidate):
         """T_target_source."""
@@ -103,8 +103,8 @@ def searches_of_unrelated(settings):
 
 
 @cache
-def searches_of_revisits(name, settings):
-    return searched(Drive.of(name).revisits, settings)
+def searches_of_revisits(name, most, settings):
+    return searched(Drive.of(name).revisits(most), settings)
 
 
 def searched(pairs, settings):
@@ -181,12 +181,15 @@ def of_small_maps(settings):
     return {f"{name}, small maps": value for name, value in false_alarms(candidates).items()}
 
 
-def of_revisits(settings):
-    """Share of the revisits that become loops by the ground they share, and how evident they are."""
+def of_revisits(settings, most=1.0):
+    """Share of the revisits that become loops by the ground they share, and how evident they are.
+
+    Of those that share up to `most`.
+    """
     judged = []
     for name in DRIFTING:
         drive = Drive.of(name)
-        pairs = searches_of_revisits(name, search_settings(settings))
+        pairs = searches_of_revisits(name, most, search_settings(settings))
         judged += judge(decided(pairs, settings), [entry.record for entry in drive.entries], drive.truth)
     much = np.array([pair.overlap > 0.3 for pair in judged])
     loop, right = (
@@ -194,14 +197,15 @@ def of_revisits(settings):
         for values in zip(*((bool(p.candidate), p.pose_is_right) for p in judged), strict=True)
     )
     score = np.array([max(pair.candidate.score, 0.0) for pair in judged])
-    return {
-        "recall above 30 %": np.mean((loop & right)[much]),
-        "recall at 10-30 %": np.mean((loop & right)[~much]),
+    measured = {
         "wrong loops": np.sum(loop & ~right),
         "revisits called ambiguous": sum("ambiguous" in pair.candidate.reason for pair in judged),
-        "mean score above 30 %": score[much].mean(),
-        "mean score at 10-30 %": score[~much].mean(),
     }
+    for name, band in (("above 30 %", much), ("at 10-30 %", ~much)):
+        if band.any():
+            measured[f"recall {name}"] = np.mean((loop & right)[band])
+            measured[f"mean score {name}"] = score[band].mean()
+    return measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +232,7 @@ def closures(*names):
     """The loops of drives by the default settings."""
     found = []
     for name in names:
-        drive, pairs = Drive.of(name), searches_of_revisits(name, Settings())
+        drive, pairs = Drive.of(name), searches_of_revisits(name, 1.0, Settings())
         for pair, loop in zip(pairs, decided(pairs, Settings()), strict=True):
             if loop:
                 x, y, yaw = *loop.T_target_source[:2, 3], yaw_of(loop.T_target_source)
