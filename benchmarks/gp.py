@@ -19,6 +19,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+from provenance import processor
 from scenes import stereo_submap
 
 LENGTH_SCALE, VARIANCE, NOISE = 0.316, 0.01, 0.02
@@ -30,9 +31,9 @@ CROP = 2.6  # metres: a square small enough to be solved exactly from all its po
 
 def surface(points):
     """Training data as every method gets them: (N, 2) and (N,), the plane taken out."""
-    from terrainloop.gp.surface import surface_of
+    from terrainloop.gp.training import detrend
 
-    made = surface_of(points)
+    made = detrend(points)
     return made.xy, made.elevation
 
 
@@ -67,22 +68,24 @@ def textbook(xy, z, x, y, threads):
 
 
 def tiles(xy, z, x, y, threads):
-    from terrainloop.gp.exact import predict_grid
-    from terrainloop.gp.kernel import Hyperparameters
+    from terrainloop.gp import exact
 
-    made = predict_grid(xy, z, Hyperparameters(LENGTH_SCALE, VARIANCE, NOISE), x, y, workers=threads)
-    return np.stack([made.elevation, made.gradient_x, made.gradient_y, made.variance, made.gradient_variance])
+    return ours(exact, xy, z, x, y, threads)
 
 
 def spline(xy, z, x, y, threads):
-    from terrainloop.gp.kernel import Hyperparameters
-    from terrainloop.gp.spline import predict_grid
+    from terrainloop.gp import spline
 
-    parameters = Hyperparameters(LENGTH_SCALE, VARIANCE, NOISE)
-    noise = np.full(len(xy), NOISE)
-    made = predict_grid(
-        xy, z, noise, parameters, (x[0], y[0]), x[1] - x[0], (len(y), len(x)), workers=threads
-    )
+    return ours(spline, xy, z, x, y, threads)
+
+
+def ours(solver, xy, z, x, y, threads):
+    from terrainloop.gp.grid import Grid
+    from terrainloop.gp.kernel import Hyperparameters
+
+    parameters, noise = Hyperparameters(LENGTH_SCALE, VARIANCE, NOISE), np.full(len(xy), NOISE)
+    grid = Grid((x[0], y[0]), x[1] - x[0], (len(y), len(x)))
+    made = solver.predict_grid(xy, z, noise, parameters, grid, workers=threads)
     return np.stack([made.elevation, made.gradient_x, made.gradient_y, made.variance, made.gradient_variance])
 
 
@@ -323,12 +326,10 @@ def markdown(results):
 def machine(threads):
     from threadpoolctl import threadpool_info
 
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
     blas = {f"{i['internal_api']} {i['version']} ({i.get('architecture')})" for i in threadpool_info()}
     core = os.environ.get("OPENBLAS_CORETYPE")
     return {
-        "cpu": names[0] if names else platform.processor(),
+        "cpu": processor(),
         "threads": threads,
         "blas": ", ".join(sorted(blas)) + (f", OPENBLAS_CORETYPE={core}" if core else ""),
         "python": platform.python_version(),

@@ -12,7 +12,6 @@ With --figure F.png, null and errors also draw what was expected against what wa
 """
 
 import argparse
-import hashlib
 import pickle
 import platform
 import time
@@ -23,21 +22,23 @@ from functools import lru_cache
 from itertools import combinations
 from multiprocessing import get_context
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import patch
 
 import cv2
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.random import SeedSequence
+from provenance import fingerprint, package
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
-from terrainloop import Settings, Submap, __version__
+from terrainloop import Settings, Submap
 from terrainloop.detection.detector import fit_database, map_submap
-from terrainloop.detection.mission import _fit_mission
-from terrainloop.evaluation.judge import judge
+from terrainloop.detection.mission import MissionMapping
 from terrainloop.evaluation.overlap import world_boxes
+from terrainloop.evaluation.pairs import evaluate_pairs
+from terrainloop.evaluation.summary import OVERLAP_BANDS
+from terrainloop.evaluation.truth import GroundTruth
 from terrainloop.geometry import inverse, parameters_of, yaw_of
 from terrainloop.io.missions import load_mission, read_sessions
 from terrainloop.io.trajectories import read_trajectory
@@ -49,8 +50,8 @@ from terrainloop.simulation.odometry import estimate, true_poses
 from terrainloop.simulation.paths import revisiting_path
 from terrainloop.simulation.terrain import make_terrain
 
-CACHE = Path.home() / ".cache" / "terrainloop-benchmarks-new"
-BANDS = ((0.3, 1.0), (0.1, 0.3))
+CACHE = Path.home() / ".cache" / "terrainloop-benchmarks"
+BANDS = OVERLAP_BANDS[::-1]
 EVIDENCE = Settings()
 INLIERS = Settings.model_validate({"match": {"decision": "inliers"}})
 
@@ -72,15 +73,10 @@ METHODS = {
 def mapped(folder):
     """Mapped submaps, their records and true poses, and sessions of a mission."""
     mission = load_mission(folder)
-    files = sorted(p for p in folder.rglob("*") if p.is_file())
-    key = hashlib.sha256(
-        repr([(str(f), f.stat().st_mtime_ns, __version__) for f in files]).encode()
-    ).hexdigest()
+    key = fingerprint(*package(), Path(__file__), folder, settings=EVIDENCE.model_dump())
     cache = CACHE / f"{key[:16]}.pickle"
     if not cache.exists():
-        parameters = _fit_mission(mission, EVIDENCE, 2)
-        submaps = [mission.read(index) for index in range(len(mission))]
-        content = [map_submap(s, EVIDENCE, parameters, workers=2) for s in submaps]
+        content = [cloud.entry for cloud in MissionMapping.of(mission, EVIDENCE, 2).clouds(1)]
         CACHE.mkdir(parents=True, exist_ok=True)
         cache.write_bytes(pickle.dumps(content))
     entries = pickle.loads(cache.read_bytes())
@@ -120,7 +116,7 @@ def judged(pool, folder, method):
         for i in range(len(poses))
         for j in range(i)
     }
-    return judge(candidates, records, poses, sessions), turned
+    return evaluate_pairs(candidates, GroundTruth(records, poses, sessions)), turned
 
 
 def recall(folders, _):
@@ -307,12 +303,8 @@ def query_time(folders, _):
         with ExitStack() as stack:
             for module, name in stages:
                 label = f"{module.__name__.rpartition('.')[2]}.{name}"
-                whole = getattr(module, name)
-                if name == "Query":
-                    whole = SimpleNamespace(of=timed(label, whole.of))
-                else:
-                    whole = timed(label, whole)
-                stack.enter_context(patch.object(module, name, whole))
+                owner, attribute = (module.Query, "of") if name == "Query" else (module, name)
+                stack.enter_context(patch.object(owner, attribute, timed(label, getattr(owner, attribute))))
             compare_many(query, stored, EVIDENCE, pairs=105)
     for name, seconds in spent.items():
         print(f"  {name}: {1e3 * seconds / len(stored):.2f} ms per pair")
@@ -357,7 +349,7 @@ def sensors(_, __):
         low = np.maximum(boxes[:, None, :2], boxes[:, :2])
         shared = np.clip(np.minimum(boxes[:, None, 2:], boxes[:, 2:]) - low, 0, None).prod(axis=-1)
         seen = shared / (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)[:, None]
-        pairs = judge(candidates, records, np.array(poses))
+        pairs = evaluate_pairs(candidates, GroundTruth(records, np.array(poses)))
         halves = [p for p in pairs if seen[int(p.candidate.source), int(p.candidate.target)] > 0.5]
         found = [p for p in halves if p.candidate and p.pose_is_right]
         wrong = sum(bool(p.candidate) and not p.pose_is_right for p in pairs)

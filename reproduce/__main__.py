@@ -2,8 +2,8 @@
 
 Regenerates the paper's figures and tables, with today's peers and with two missions beyond it (Mars and
 EtnaLidar, simulated, too): ``python -m reproduce`` from the root of the repository. Real missions are given
-with --mission. Every OUT/NAME.png has its numbers in OUT/NAME.csv. What is done is kept: run it again to
-resume.
+with --mission. Every OUT/NAME.png has its numbers in OUT/NAME.csv. Run it again to resume: results
+are reused as long as code, missions and settings stay the same.
 """
 
 import argparse
@@ -15,22 +15,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from reproduce import figures, ours, table
-from reproduce.missions import (
-    BEYOND,
-    PAPER,
-    QUICK,
-    SUBMAPS,
-    SUBMAPS_QUICK,
-    Drive,
-    real,
-    simulated,
-)
+from benchmarks.provenance import processor
+from reproduce import figures, table
+from reproduce.baselines import ours
+from reproduce.kept import versions
+from reproduce.missions import BEYOND, PAPER, QUICK, SUBMAPS, SUBMAPS_QUICK, Drive, real, simulated
 from reproduce.results import Result, best_of_each
-from reproduce.runner import ROOT, run_all, tasks_of, versions
+from reproduce.runner import ROOT, run_all, tasks_of
 from reproduce.visual import frames_of
 from terrainloop.errors import TerrainLoopError
-from terrainloop.io.results import write_whole
+from terrainloop.io.files import write_whole_text
 
 STAND_INS = (
     "The paper's datasets are not public: Etna1-4 and Morocco here are simulated stand-ins "
@@ -46,7 +40,7 @@ TIMES = (
 )
 NONE = "'-': no pair could be compared: there are no images, colours or odometry, or too little was found."
 REAL = ROOT.parent / "shared/data/missions/pozo_r20"  # taken where it is there
-BASELINES = "terrainloop.evaluation.baselines."
+BASELINES = "reproduce.baselines."
 PAPERS = ("default", "paper", "shot", "random_score")
 PEERS = ("default", "fpfh", "kiss", "map_closures", "scan_context", "odometry_icp", "ibow", "random_score")
 NEEDED = {  # modules with the methods that each figure or table shows
@@ -133,18 +127,11 @@ def record_run(args: argparse.Namespace, out: Path, drives: Sequence[Drive]) -> 
         "workers": args.workers,
         "threads_per_task": 1,
     }
-    write_whole(out / "settings.json", lambda file: json.dump(record, file, indent=2))
+    write_whole_text(out / "settings.json", lambda file: json.dump(record, file, indent=2))
 
 
 def machine() -> dict[str, str | int | None]:
     return {"system": platform.platform(), "processor": processor(), "cores": os.cpu_count()}
-
-
-def processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.exists() else []
-    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return named[0] if named else platform.processor()
 
 
 def write_figures(
@@ -172,13 +159,13 @@ def curves(by_mission: Mapping[str, Sequence[Result]], modules: Sequence[str], o
     """As the paper has them, and where a match is right only with its pose."""
     methods = dict.fromkeys(r.method for results in by_mission.values() for r in results)
     looks = figures.looks_of(list(methods))
-    for reading, stem in (("overlap", name), ("pose", f"{name}_pose")):
+    for criterion, stem in (("overlap", name), ("pose", f"{name}_pose")):
         chosen = {
-            mission: best_of_each([r for r in results if r.module in modules], reading)
+            mission: best_of_each([r for r in results if r.module in modules], criterion)
             for mission, results in by_mission.items()
         }
-        title = f"A match is right by {reading}. Of each baseline the best settings on each mission"
-        figures.precision_recall_curves(chosen, reading, looks, title).save(out, stem)
+        title = f"A match is right by {criterion}. Of each baseline the best settings on each mission"
+        figures.precision_recall_curves(chosen, criterion, looks, title).save(out, stem)
 
 
 def example_of(results: Sequence[Result]) -> Result | None:

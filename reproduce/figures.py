@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from reproduce.missions import Drive
 from reproduce.results import Result
 from reproduce.visual import ALIKE, Frames
-from terrainloop.evaluation.judge import JudgedPair
+from terrainloop.evaluation.pairs import EvaluatedPair
 from terrainloop.evaluation.precision_recall import OperatingPoint, precision_recall
 from terrainloop.geometry import transform
-from terrainloop.io.results import write_whole
+from terrainloop.io.files import write_whole_text
 from terrainloop.report.figures import SOURCE_COLOUR, TARGET_COLOUR, save_figure
 
 INLIER_THRESHOLDS = tuple(range(1, 21))  # the paper's
@@ -47,7 +47,7 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         writer.writeheader()
         writer.writerows(rows)
 
-    write_whole(path, write)
+    write_whole_text(path, write)
 
 
 def trajectories(drives: Sequence[Drive]) -> Plate:
@@ -94,7 +94,7 @@ def visual_curves(frames: Sequence[Frames], control: Sequence[Frames]) -> Plate:
 
 
 def precision_recall_curves(
-    chosen: Mapping[str, Sequence[Result]], reading: str, looks: Mapping[str, Look], title: str
+    chosen: Mapping[str, Sequence[Result]], criterion: str, looks: Mapping[str, Look], title: str
 ) -> Plate:
     """Precision against recall over every distinct score, a panel for each mission (Fig. 8)."""
     figure, panels = _panels(len(chosen) + 1, height=3.1)  # the last one is for the legend
@@ -102,15 +102,15 @@ def precision_recall_curves(
     rows, lines = [], {}
     for axes, (name, results) in zip(panels, chosen.items(), strict=False):
         for result in results:
-            points = result.readings["boxes"][reading].curve()
+            points = result.criteria["boxes"][criterion].curve()
             recall, precision = _steps(points)
             (lines[result.method],) = axes.plot(
                 recall, precision, drawstyle="steps-pre", **looks[result.method]
             )
-            rows += [_row_of_curve(result, reading, point) for point in points]
+            rows += [_row_of_curve(result, criterion, point) for point in points]
         _unit_axes(axes, "recall")
         axes.set_xlim(-0.03, 1.03)
-        _title(axes, f"{name}: {results[0].metrics(reading).true_pairs} true pairs" if results else name)
+        _title(axes, f"{name}: {results[0].metrics(criterion).true_pairs} true pairs" if results else name)
     panels[-1].axis("off")
     panels[-1].legend(lines.values(), lines.keys(), loc="center", frameon=False)
     return Plate(figure, rows)
@@ -122,12 +122,12 @@ def _steps(points: Sequence[OperatingPoint]) -> tuple[list[float], list[float]]:
     return [0.0, *recall], [*precision[:1], *precision]
 
 
-def _row_of_curve(result: Result, reading: str, point: OperatingPoint) -> dict[str, Any]:
+def _row_of_curve(result: Result, criterion: str, point: OperatingPoint) -> dict[str, Any]:
     return {
         "mission": result.drive.name,
         "method": result.method,
         "settings": result.settings,
-        "right_by": reading,
+        "right_by": criterion,
         **_counts(point),
     }
 
@@ -144,8 +144,8 @@ def precision_by_inliers(results: Sequence[Result]) -> Plate:
     axes = figure.add_subplot()
     counted = {}
     for result in results:
-        reading = result.readings["boxes"]["overlap"]
-        counted[result.drive.name] = (reading.scores, reading.is_true)
+        criterion = result.criteria["boxes"]["overlap"]
+        counted[result.drive.name] = (criterion.scores, criterion.is_true)
     everything = tuple(np.concatenate(column) for column in zip(*counted.values(), strict=True))
     rows = []
     for name, (scores, is_true) in {**counted, "all": everything}.items():
@@ -216,7 +216,7 @@ def _draw_clouds(axes: Axes, drive: Drive, poses: np.ndarray, source: int, targe
     axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
 
 
-def _row_of_loop(drive: Drive, method: str, pair: JudgedPair) -> dict[str, Any]:
+def _row_of_loop(drive: Drive, method: str, pair: EvaluatedPair) -> dict[str, Any]:
     return {
         "mission": drive.name,
         "method": method,

@@ -1,5 +1,6 @@
-"""The missions: simulated stand-ins for the paper's, others beyond it, and real ones where given."""
+"""The missions: simulated stand-ins for the paper's, further simulated ones, and real ones if given."""
 
+import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,14 +11,16 @@ import cv2
 import numpy as np
 import yaml
 
+from benchmarks.provenance import fingerprint
+from reproduce.appearance.rendering import colours_of, images_of
+from reproduce.baselines.method import Observation, Scale
+from reproduce.kept import code_key, is_current
 from terrainloop.errors import TerrainLoopError
-from terrainloop.evaluation.baselines.method import Observation, Scale
 from terrainloop.evaluation.overlap import ground_cell, observed_iou
 from terrainloop.io.missions import Mission, load_mission, read_sessions
-from terrainloop.record import SubmapRecord
 from terrainloop.io.trajectories import Trajectory, write_tum
+from terrainloop.record import SubmapRecord
 from terrainloop.simulation.missions import SimulatedMission, simulate_mission, write_mission
-from terrainloop.simulation.rendering import colours_of, images_of
 from terrainloop.submap import Submap
 
 SUBMAPS, SUBMAPS_QUICK = 16, 8  # the paper's datasets have about 15
@@ -50,17 +53,23 @@ QUICK = (PAPER[0], PAPER[4])
 REAL_MIN_OVERLAP = 0.3
 REAL_SUBMAPS = 30  # of a real mission: every pair is scored by every method
 SESSIONS_FILE = "passes.csv"
+RECORD_FILE = "made_by.json"  # key of the code that simulated the mission
 FRAMES_FILE = "frames.npy"  # T_world_body at each image, (submaps, images, 4, 4)
 EVERY = 2  # frames from image to image: 1 m
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A mission on disk, and what makes a true match on it."""
+    """A mission on disk, and the overlap of a true match."""
 
     name: str
     path: Path
     min_overlap: float
+
+    @cached_property
+    def key(self) -> str:
+        """Fingerprint of every file in its folder."""
+        return fingerprint(self.path)
 
     @cached_property
     def mission(self) -> Mission:
@@ -68,7 +77,7 @@ class Drive:
 
     @cached_property
     def sessions(self) -> dict[str, str] | None:
-        """Session of each submap by name, where a file beside the clouds tells."""
+        """Session of each submap by name, if a file beside the clouds lists them."""
         file = self.path / SESSIONS_FILE
         return read_sessions(file) if file.exists() else None
 
@@ -79,7 +88,7 @@ class Drive:
             raise TerrainLoopError(
                 expected=f"truth.tum in {self.path}",
                 found="none",
-                mend="give the true pose of each submap, one line a cloud",
+                mend="give the true pose of each submap, one line per cloud",
             )
         return self.mission.truth.poses
 
@@ -102,7 +111,7 @@ class Drive:
         return observed_iou(clouds, self.poses, ground_cell(clouds))
 
     def observations(self) -> Iterator[Observation]:
-        """All that a method may know of each submap, in the order driven."""
+        """The data of each submap that a method has access to, in chronological order."""
         odometry = self.mission.odometry
         for i, (name, submap) in enumerate(zip(self.mission.names, self.submaps, strict=True)):
             yield Observation(
@@ -114,16 +123,16 @@ class Drive:
 
     @property
     def filmed(self) -> bool:
-        """Whether a camera went along whose poses are known."""
+        """Whether there are camera images with known poses."""
         return (self.path / FRAMES_FILE).exists() and any((self.path / "images").iterdir())
 
     def images(self, name: str) -> list[np.ndarray]:
-        """Camera images of a submap, grey, in the order driven."""
+        """Grey camera images of a submap in chronological order."""
         files = sorted((self.path / "images").glob(f"{name}_*.png"))
         return [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]
 
     def pairs(self) -> list[tuple[int, int]]:
-        """Every (source, target) that is judged: source later, not consecutive, of another session."""
+        """Every (source, target) that is evaluated: source later, not consecutive, of another session."""
         return pairs_of(self.mission.names, self.sessions)
 
 
@@ -141,7 +150,7 @@ def _colours(file: Path) -> np.ndarray | None:
 
 
 def simulated(stand_in: StandIn, folder: Path, submaps: int) -> Drive:
-    """The stand-in as a mission folder, simulated unless it is there already."""
+    """The stand-in as a mission folder; simulated unless already there from the same code."""
     path = folder / stand_in.name
     asked = {
         "world": stand_in.world,
@@ -151,7 +160,7 @@ def simulated(stand_in: StandIn, folder: Path, submaps: int) -> Drive:
     }
     if path.exists():
         _check_same(path, asked)
-    else:
+    if not is_current(path / RECORD_FILE, code_key()):
         print(f"simulating {stand_in.name}: {stand_in.world}, seed {stand_in.seed}, {stand_in.sensor}")
         aside = folder / f".{stand_in.name}"
         shutil.rmtree(aside, ignore_errors=True)
@@ -159,12 +168,14 @@ def simulated(stand_in: StandIn, folder: Path, submaps: int) -> Drive:
         mission = simulate_mission(**asked)
         write_mission(mission, aside)
         _write_appearance(mission, aside)
+        (aside / RECORD_FILE).write_text(json.dumps({"key": code_key()}))
+        shutil.rmtree(path, ignore_errors=True)
         aside.rename(path)
     return Drive(stand_in.name, path, stand_in.min_overlap)
 
 
 def _write_appearance(mission: SimulatedMission, folder: Path) -> None:
-    """What the camera saw: images, true pose of the rover at each, and the colours of the points."""
+    """Camera images, the true pose of the rover at each, and the colours of the points."""
     for name in ("images", "colours"):
         (folder / name).mkdir(exist_ok=True)
     for i, (images, colours) in enumerate(zip(images_of(mission, EVERY), colours_of(mission), strict=True)):
@@ -185,17 +196,14 @@ def _check_same(path: Path, asked: Mapping[str, object]) -> None:
 
 
 def real(path: Path, folder: Path) -> Drive:
-    """A mission of others; of a large one, the submaps nearest its middle, linked to from the folder."""
+    """A real mission; of a large one, the submaps nearest its middle, as links in the folder."""
     drive = Drive(path.name, path, REAL_MIN_OVERLAP)
     if len(drive.poses) <= REAL_SUBMAPS:
         return drive
     print(f"{drive.name}: of {len(drive.mission)} submaps the {REAL_SUBMAPS} nearest the middle")
     part = folder / path.name
-    if not part.exists():
-        aside = folder / f".{path.name}"
-        shutil.rmtree(aside, ignore_errors=True)
-        _write_part(drive, aside)
-        aside.rename(part)
+    shutil.rmtree(part, ignore_errors=True)  # links and two tables, cheap enough to be rewritten every time
+    _write_part(drive, part)
     return Drive(path.name, part, REAL_MIN_OVERLAP)
 
 

@@ -1,4 +1,4 @@
-"""What the runner left, read back and held against the truth."""
+"""What the runner left, read back and evaluated."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,16 +10,18 @@ import numpy as np
 
 from reproduce.missions import Drive
 from reproduce.runner import Task, read_pairs
-from terrainloop.evaluation.judge import JudgedPair, Reading, judge, readings
+from terrainloop.evaluation.criteria import Criterion, criteria
+from terrainloop.evaluation.pairs import EvaluatedPair, evaluate_pairs
 from terrainloop.evaluation.precision_recall import Metrics
+from terrainloop.evaluation.truth import GroundTruth
 
-READINGS = ("overlap", "overlap and pose", "pose")  # the paper's; the strictest; see `judge.readings`
+CRITERIA = ("overlap", "overlap and pose", "pose")  # the paper's; the strictest; see `evaluation.criteria`
 GROUNDS = ("boxes", "observed")  # the paper's: bounding boxes; ground that was really seen
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """One method with one choice of settings on one mission, judged.
+    """One method with one choice of settings on one mission, evaluated.
 
     Attributes
     ----------
@@ -30,7 +32,7 @@ class Result:
         Number of the choice of settings.
     record : mapping
         Settings, software, times, as the runner wrote them.
-    pairs : list of JudgedPair
+    pairs : list of EvaluatedPair
     """
 
     drive: Drive
@@ -38,14 +40,15 @@ class Result:
     method: str
     variant: int
     record: Mapping[str, Any]
-    pairs: Sequence[JudgedPair]
+    pairs: Sequence[EvaluatedPair]
     _measured: dict[tuple[str, str], Metrics] = field(default_factory=dict, init=False)
 
     @classmethod
     def of(cls, task: Task) -> "Result":
         drive = task.drive
         record = json.loads(task.json.read_text(encoding="utf-8"))
-        pairs = judge(read_pairs(task.csv), drive.records, drive.poses, drive.sessions, drive.observed_iou)
+        truth = GroundTruth(drive.records, drive.poses, drive.sessions, drive.observed_iou)
+        pairs = evaluate_pairs(read_pairs(task.csv), truth)
         return cls(drive, task.short_module, task.method.name, task.variant, record, pairs)
 
     @property
@@ -53,30 +56,30 @@ class Result:
         return " ".join(f"{key}={value}" for key, value in self.record["settings"].items())
 
     @cached_property
-    def readings(self) -> dict[str, dict[str, Reading]]:
+    def criteria(self) -> dict[str, dict[str, Criterion]]:
         """By the ground that counts, then by what is called right."""
         return {
-            ground: readings(self.pairs, self.drive.min_overlap, observed=ground == "observed")
+            ground: criteria(self.pairs, self.drive.min_overlap, observed=ground == "observed")
             for ground in GROUNDS
         }
 
-    def metrics(self, reading: str, ground: str = "boxes") -> Metrics:
+    def metrics(self, criterion: str, ground: str = "boxes") -> Metrics:
         """Recall at full precision, largest F1, average precision, with intervals."""
-        key = (reading, ground)
+        key = (criterion, ground)
         if key not in self._measured:
-            self._measured[key] = self.readings[ground][reading].metrics()
+            self._measured[key] = self.criteria[ground][criterion].metrics()
         return self._measured[key]
 
     @cached_property
-    def registered(self) -> list[JudgedPair]:
+    def registered(self) -> list[EvaluatedPair]:
         """The true pairs that got the right pose, whatever their score."""
-        true = self.readings["boxes"]["overlap"].is_true
+        true = self.criteria["boxes"]["overlap"].is_true
         return [
             pair for pair, is_true in zip(self.pairs, true, strict=True) if is_true and pair.pose_is_right
         ]
 
 
-def best_of_each(results: Iterable[Result], reading: str) -> list[Result]:
+def best_of_each(results: Iterable[Result], criterion: str) -> list[Result]:
     """The variant of each method with the highest recall at full precision, then average precision.
 
     Methods that could compare no pair are left out.
@@ -85,7 +88,7 @@ def best_of_each(results: Iterable[Result], reading: str) -> list[Result]:
     for result in results:
         if all(pair.candidate.score == -np.inf for pair in result.pairs):
             continue
-        metrics = result.metrics(reading)
+        metrics = result.metrics(criterion)
         key = (metrics.recall_at_full_precision.value, metrics.average_precision.value)
         key = tuple(np.nan_to_num(key, nan=-1.0))
         if result.method not in best or key > best[result.method][0]:

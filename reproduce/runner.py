@@ -1,14 +1,14 @@
 """Runs every method on every mission, each in a process of its own with one thread; resumes.
 
-A task leaves OUT/MISSION/METHOD-K.csv (source, target, score, transform) and a JSON beside it with
-settings, software and times; K numbers the choices of settings. What is there already is not done again.
+A task leaves OUT/MISSION/METHOD-K.csv (source, target, score, transform) and a JSON record beside it with
+settings, software and times; K numbers the choices of settings. A task is skipped if its results exist and
+their record has the key of the present code, mission, settings and processor.
 """
 
 import csv
 import json
 import os
 import pickle
-import platform
 import resource
 import subprocess
 import sys
@@ -16,6 +16,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from queue import Queue
@@ -25,13 +26,15 @@ import cv2
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from reproduce import ours
+from benchmarks.provenance import fingerprint, processor
+from reproduce.baselines import ours
+from reproduce.baselines.method import Match, Method, Scale
+from reproduce.kept import code_key, is_current, versions
 from reproduce.missions import Drive
-from terrainloop import __version__
 from terrainloop.errors import TerrainLoopError
-from terrainloop.evaluation.baselines.method import Match, Method, Scale
 from terrainloop.geometry import parameters_of, se3
-from terrainloop.io.results import POSE_COLUMNS, write_whole
+from terrainloop.io.files import write_whole_text
+from terrainloop.io.results import POSE_COLUMNS
 
 ROOT = Path(__file__).parent.parent
 PROCESSORS = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
@@ -76,19 +79,28 @@ class Task:
     def json(self) -> Path:
         return self.folder / f"{self.stem}.json"
 
+    @cached_property
+    def key(self) -> str:
+        """Fingerprint of everything that its results depend on; its times depend on the processor."""
+        return fingerprint(
+            code=code_key(),
+            mission=self.drive.key,
+            module=self.module,
+            variant=self.variant,
+            settings=dict(self.method.settings),
+            software=self.method.software,
+            processor=processor(),
+        )
+
     @property
     def done(self) -> bool:
-        """Whether its results are there, by the same software and settings."""
-        if not (self.json.exists() and self.csv.exists()):
-            return False
-        there = json.loads(self.json.read_text(encoding="utf-8"))
-        asked = {"settings": dict(self.method.settings), "software": self.method.software}
-        return {key: there[key] for key in asked} == json.loads(json.dumps(asked))
+        """Whether its results exist, under its key."""
+        return self.csv.exists() and is_current(self.json, self.key)
 
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A pair as a method scored it; what `terrainloop.evaluation.judge` takes."""
+    """A pair as a method scored it; what `terrainloop.evaluation.pairs` takes."""
 
     source: str
     target: str
@@ -99,7 +111,7 @@ class Scored:
 def methods_of(module: str, drive: Drive, scale: Scale) -> tuple[Method, ...]:
     """Our own by the name of its settings, else all variants of the baseline in a Python module."""
     if module in ours.SETTINGS:
-        return (ours.method(module, drive),)
+        return (ours.method_of(module, drive.submaps),)
     return import_module(module).methods(scale)
 
 
@@ -192,17 +204,18 @@ def execute(task: Task) -> None:
         "pair_wall_ms": pairing.median("wall"),
         "megabytes": megabytes(kept),
     }
-    write_whole(task.csv, lambda file: _write_pairs(file, scored))
+    write_whole_text(task.csv, lambda file: _write_pairs(file, scored))
     record = {
         "mission": task.drive.name,
         "method": method.name,
         "settings": dict(method.settings),
         "software": method.software,
+        "key": task.key,
         "pairs": len(scored),
         **spent,
         "versions": versions(),
     }
-    write_whole(task.json, lambda file: json.dump(record, file, indent=2))
+    write_whole_text(task.json, lambda file: json.dump(record, file, indent=2))
 
 
 class Stopwatch:
@@ -240,15 +253,6 @@ def megabytes(kept: Sequence[Any]) -> float | None:
         return float(np.median([len(pickle.dumps(one)) for one in kept])) / 1e6
     except (TypeError, AttributeError, pickle.PicklingError):
         return None
-
-
-def versions() -> dict[str, str]:
-    return {
-        "terrainloop": __version__,
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "opencv": cv2.__version__,
-    }
 
 
 def _write_pairs(file, scored: Iterable[tuple[str, str, Match]]) -> None:

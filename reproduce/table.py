@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 
 from reproduce.figures import write_rows
-from reproduce.results import GROUNDS, READINGS, Result, best_of_each
+from reproduce.results import CRITERIA, GROUNDS, Result, best_of_each
 from terrainloop.evaluation.precision_recall import Metrics
-from terrainloop.io.results import write_whole
+from terrainloop.io.files import write_whole_text
 
 Rows = list[dict[str, Any]]
 
 
 def main_table(by_mission: Mapping[str, Sequence[Result]]) -> Rows:
-    """A row for each mission and method: best by the paper's reading, and best by the pose."""
+    """A row for each mission and method: best by the criterion of the paper, and best by pose."""
     rows: Rows = []
     for mission, results in by_mission.items():
         by_pose = {result.method: result for result in best_of_each(results, "pose")}
@@ -57,19 +57,19 @@ def _numbers(metrics: Metrics) -> dict[str, float]:
 
 
 def sweep(results: Iterable[Result]) -> Rows:
-    """Every choice of settings by every reading of right and wrong and of shared ground: nothing picked."""
+    """Every choice of settings by every criterion and overlap: nothing selected."""
     return [
         {
             "mission": result.drive.name,
             "method": result.method,
             "settings": result.settings,
             "ground": ground,
-            "right_by": reading,
-            **_numbers(result.metrics(reading, ground)),
+            "right_by": criterion,
+            **_numbers(result.metrics(criterion, ground)),
         }
         for result in results
         for ground in GROUNDS
-        for reading in READINGS
+        for criterion in CRITERIA
     ]
 
 
@@ -98,7 +98,7 @@ def times(by_mission: Mapping[str, Sequence[Result]]) -> Rows:
 
 def save(folder: Path, stem: str, rows: Rows, text: str) -> None:
     write_rows(folder / f"{stem}.csv", rows)
-    write_whole(folder / f"{stem}.md", lambda file: file.write(text))
+    write_whole_text(folder / f"{stem}.md", lambda file: file.write(text))
 
 
 def markdown_of_table(rows: Rows, notes: Sequence[str]) -> str:

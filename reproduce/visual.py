@@ -1,5 +1,6 @@
 """Visual loop closures, image by image (paper, Fig. 7): the images of the same drives, in a bag of words."""
 
+import json
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from csv import DictReader
@@ -8,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.provenance import fingerprint
+from reproduce.baselines.ibow import closures, features_of
+from reproduce.kept import code_key, is_current
 from reproduce.missions import FRAMES_FILE, Drive
-from terrainloop.evaluation.baselines.ibow import closures, features_of
 from terrainloop.geometry import yaw_of
-from terrainloop.io.results import write_whole
+from terrainloop.io.files import write_whole_text
 
 SKIPPED = 14  # images just before one: two submaps of 7 m, as pairs of neighbours are left out
 NEAR = 2.0  # metres between two cameras that are at the same place
@@ -20,18 +23,18 @@ ALIKE = np.radians(30.0)  # between two headings with the same view
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Images of a drive with what the bag of words says of each, and the truth.
+    """Loop closures of the images of a drive, and the ground truth.
 
     Attributes
     ----------
     name : str
-        Of the mission.
+        Name of the mission.
     closed : array, (N,) int
-        Earlier image that is taken for the same place, -1 for none.
+        Earlier image that is considered the same place, -1 for none.
     inliers : array, (N,)
-        Of the epipolar check: the score.
+        Inliers of the epipolar check: the score.
     near, alike : array, (N, N) bool
-        Whether an earlier image, not just before, is of the same place; with the same view.
+        Whether an earlier image, but not one just before, is of the same place; with a similar heading.
     """
 
     name: str
@@ -42,9 +45,12 @@ class Frames:
 
     @classmethod
     def of(cls, drive: Drive, file: Path, skipped: int = SKIPPED) -> "Frames":
-        """Read what is in the file; made first, if it is not there."""
-        if not file.exists():
+        """Read the loops of a drive from a file; detect them first if it is missing or out of date."""
+        key = fingerprint(code=code_key(), mission=drive.key, skipped=skipped)
+        record = file.with_suffix(".json")
+        if not (file.exists() and is_current(record, key)):
             _write(drive, file, skipped)
+            write_whole_text(record, lambda output: json.dump({"key": key}, output))
         with file.open(newline="", encoding="utf-8") as lines:
             rows = list(DictReader(lines))
         closed, inliers = (np.array([int(row[key]) for row in rows]) for key in ("closed", "inliers"))
@@ -57,16 +63,16 @@ class Frames:
         return cls(drive.name, closed, inliers, near, near & (turned < ALIKE))
 
     def judged(self, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Score, whether there is a place to be found, whether it was found; for each image."""
+        """Score, whether there is a true loop, whether it was found; for each image."""
         scores = np.where(self.closed >= 0, self.inliers, -np.inf)
         found = (self.closed >= 0) & truth[np.arange(len(truth)), self.closed]
         return scores, truth.any(axis=1), found
 
 
 def frames_of(drives: Sequence[Drive], out: Path, workers: int) -> tuple[list[Frames], list[Frames]]:
-    """Of drives with images; and the control, in which the images just before are not left out.
+    """Loop closures of drives with images, and of a control in which the images just before are included.
 
-    The control tells whether the bag of words works at all: the image before was taken a metre behind.
+    The control checks that the bag of words works at all: the preceding image was taken one metre earlier.
     """
 
     def one(drive: Drive, stem: str, skipped: int) -> Frames:
@@ -81,6 +87,6 @@ def frames_of(drives: Sequence[Drive], out: Path, workers: int) -> tuple[list[Fr
 def _write(drive: Drive, file: Path, skipped: int) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     features = [features_of(image) for name in drive.mission.names for image in drive.images(name)]
-    said = closures(features, skipped)
-    lines = ["image,closed,inliers", *(f"{i},{one.image},{one.inliers}" for i, one in enumerate(said))]
-    write_whole(file, lambda output: output.write("\n".join(lines) + "\n"))
+    found = closures(features, skipped)
+    lines = ["image,closed,inliers", *(f"{i},{one.image},{one.inliers}" for i, one in enumerate(found))]
+    write_whole_text(file, lambda output: output.write("\n".join(lines) + "\n"))

@@ -1,11 +1,14 @@
 """A small synthetic world, known in closed form, that the tests from map to command line share."""
 
-from dataclasses import dataclass
+import logging
+import sys
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 import pytest
 
+from terrainloop.cli import main
 from terrainloop.config import FeatureSettings, MapSettings, MatchSettings, Settings
 from terrainloop.geometry import inverse, se3, transform
 from terrainloop.gp.kernel import Hyperparameters
@@ -40,6 +43,14 @@ def with_match(settings, **changes):
 
 
 BY_INLIERS = with_match(STRICT, decision="inliers")
+
+
+def with_pixels(gradient_map, pixels, **values):
+    """The map with other values at some pixels."""
+    images = {name: getattr(gradient_map, name).copy() for name in values}
+    for name, image in images.items():
+        image[pixels] = values[name]
+    return replace(gradient_map, **images)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,3 +194,21 @@ def mission_folder(tmp_path_factory):
 def true_loop():
     """T_target_source of the mission's one loop, 000003 to 000000."""
     return inverse(PLACES["000000"].T_world_submap) @ PLACES["000003"].T_world_submap
+
+
+@pytest.fixture
+def cli(monkeypatch, capsys):
+    """Runs ``terrainloop`` with arguments; gives exit code, stdout and stderr."""
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["terrainloop", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        out, err = capsys.readouterr()
+        return ended.value.code or 0, out, err
+
+    yield run
+    root.handlers[:] = handlers
+    root.setLevel(level)

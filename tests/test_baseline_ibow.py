@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from terrainloop.evaluation.baselines import ibow
-from terrainloop.evaluation.baselines.ibow import (
+from reproduce.baselines import ibow
+from reproduce.baselines.ibow import (
     Features,
     Vocabulary,
     _islands,
@@ -13,7 +13,7 @@ from terrainloop.evaluation.baselines.ibow import (
     features_of,
     methods,
 )
-from terrainloop.evaluation.baselines.method import NOT_COMPARABLE, Observation, Scale
+from reproduce.baselines.method import NOT_COMPARABLE, Observation, Scale
 from terrainloop.submap import Submap
 
 

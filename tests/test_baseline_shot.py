@@ -4,9 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from reproduce.baselines import shot
+from reproduce.baselines.method import NOT_COMPARABLE, Observation, Scale
 from terrainloop.errors import TerrainLoopError
-from terrainloop.evaluation.baselines import shot
-from terrainloop.evaluation.baselines.method import NOT_COMPARABLE, Observation, Scale
 from terrainloop.geometry import inverse, se3, transform
 from terrainloop.submap import Submap
 

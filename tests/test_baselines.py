@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from terrainloop.config import Settings
-from terrainloop.errors import TerrainLoopError
-from terrainloop.evaluation.baselines import (
+from reproduce.baselines import (
     fpfh,
     kiss,
     map_closures,
@@ -14,7 +12,9 @@ from terrainloop.evaluation.baselines import (
     random_score,
     scan_context,
 )
-from terrainloop.evaluation.baselines.method import NOT_COMPARABLE, Observation, Scale, require
+from reproduce.baselines.method import NOT_COMPARABLE, Observation, Scale, require
+from terrainloop.config import Settings
+from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import inverse, se3, transform, yaw_of
 from terrainloop.matching.register import compare
 from terrainloop.submap import Submap
@@ -28,9 +28,14 @@ PACKAGES = {
 MOVED = se3(0.6, -0.4, 0.3, 0.0, 0.0, 2.0)  # T_target_source
 
 
-def methods_of(module, places):
+def need_package_of(module):
+    """Skip where the package of a method is missing, or a library of the system that it asks for."""
     if module in PACKAGES:
-        pytest.importorskip(PACKAGES[module])
+        pytest.importorskip(PACKAGES[module], exc_type=ImportError)
+
+
+def methods_of(module, places):
+    need_package_of(module)
     return module.methods(Scale.of([place.submap for place in places]))
 
 
@@ -122,8 +127,7 @@ def test_a_pair_scores_the_same_whatever_was_scored_before(places, module):
 
 @pytest.mark.parametrize("module", [fpfh, kiss, map_closures, odometry_icp, scan_context])
 def test_settings_scale_with_the_submaps(places, module):
-    if module in PACKAGES:
-        pytest.importorskip(PACKAGES[module])
+    need_package_of(module)
     small, large = (module.methods(Scale(spacing=0.02 * k, side=10.0 * k)) for k in (1, 4))
     assert len({tuple(method.settings.items()) for method in small}) == len(small) >= 2
     for one, other in zip(small, large, strict=True):
@@ -198,3 +202,13 @@ def test_the_papers_score_is_nought_where_the_gradients_differ(small_places, by_
 def test_a_package_that_is_missing_is_one_clear_line():
     with pytest.raises(TerrainLoopError, match="pip install no-such-package"):
         require("no_such_module", "no-such-package")
+
+
+def test_a_package_that_lacks_a_library_of_the_system_is_not_to_be_installed_again(tmp_path, monkeypatch):
+    line = "libusb-1.0.so.0: cannot open shared object file"
+    (tmp_path / "half_installed.py").write_text(f"raise ImportError({line!r})")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(TerrainLoopError, match=r"found libusb-1\.0") as error:
+        require("half_installed", "half-installed")
+    assert "pip install" not in str(error.value)
+    assert "\n" not in str(error.value)

@@ -1,8 +1,8 @@
 """Every command as users run it: what it writes, what it says, and how it ends."""
 
 import csv
+import io
 import json
-import logging
 import shutil
 import subprocess
 import sys
@@ -16,7 +16,7 @@ from conftest import BROKEN, PLACES, STRICT
 
 import terrainloop.config
 import terrainloop.detection.mission  # it must have the true Settings before the demo's are replaced
-from terrainloop.cli import main
+from terrainloop.cli.terminal import console_of, table_of
 from terrainloop.config import Settings
 from terrainloop.geometry import parameters_of, transform
 from terrainloop.gradient_map import GradientMap
@@ -29,29 +29,6 @@ CONTRACT = [  # DESIGN.md, section 3
 FAST = STRICT.model_copy(
     update={"map": STRICT.map.model_copy(update={"max_points": 550, "resolution": 0.12})}
 )
-
-
-@pytest.fixture(autouse=True)
-def _logging_as_it_was():
-    root = logging.getLogger()
-    handlers, level = root.handlers[:], root.level
-    yield
-    root.handlers[:] = handlers
-    root.setLevel(level)
-
-
-@pytest.fixture
-def cli(monkeypatch, capsys):
-    """Runs ``terrainloop`` with arguments; gives exit code, stdout and stderr."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["terrainloop", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        out, err = capsys.readouterr()
-        return ended.value.code or 0, out, err
-
-    return run
 
 
 @pytest.fixture
@@ -295,6 +272,13 @@ def run(detected, tmp_path):
     return shutil.copytree(detected[0], tmp_path / "run")
 
 
+def write_rows(path, rows):
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 def rows_of(path):
     with path.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
@@ -370,14 +354,14 @@ def test_detect_is_silent_when_asked(cli, mission_folder, config, tmp_path):
 
 
 def test_a_run_by_inliers_is_scored_over_inliers(ok, run, mission_folder, tmp_path):
-    for name in ("pairs.csv", "submaps.csv"):
+    for name in ("loops.csv", "pairs.csv", "submaps.csv"):
         (tmp_path / name).write_bytes((run / name).read_bytes())
     (tmp_path / "config.yaml").write_text("match: {decision: inliers}")
     told = json.loads(ok("evaluate", tmp_path, "--truth", mission_folder / "truth.tum", "--json"))
     assert told["threshold"] == "inliers"
     assert [point["min_inliers"] for point in told["precision_recall"]] == list(range(1, 21))
     assert "min_inliers" in rows_of(tmp_path / "precision_recall_curve.csv")[0]
-    assert "inliers >=" in ok("evaluate", tmp_path, "--truth", mission_folder / "truth.tum")
+    assert "inliers" in ok("evaluate", tmp_path, "--truth", mission_folder / "truth.tum")
 
 
 def test_evaluate_scores_the_run(ok, run, mission_folder):
@@ -401,7 +385,7 @@ def test_evaluate_scores_the_run(ok, run, mission_folder):
 RIGHT_BY = ["overlap", "overlap and pose", "pose"]
 
 
-def test_evaluate_tells_the_curve_in_numbers(ok, run, mission_folder):
+def test_evaluate_summarises_the_curve(ok, run, mission_folder):
     told = json.loads(ok("evaluate", run, "--truth", mission_folder / "truth.tum", "--json"))
     assert told["threshold"] == "score"
     assert [(m["truth"], m["right_by"]) for m in told["metrics"]] == [("box", by) for by in RIGHT_BY]
@@ -423,16 +407,72 @@ def test_evaluate_by_the_ground_observed(ok, run, mission_folder):
     keys = [(m["truth"], m["right_by"]) for m in told["metrics"]]
     assert keys == [(truth, by) for truth in ("box", "observed") for by in RIGHT_BY]
     assert {m["true_pairs"] for m in told["metrics"]} == {1}
+    assert [row["truth"] for row in told["retrieval"]] == ["box", "observed"]
     text = in_one_line(ok(*arguments))
-    assert "Bounding-box IoU > 0.3: 1 true pair " in text
-    assert "IoU of the observed ground > 0.3: 1 true pair " in text
+    assert "1 true pair: bounding-box IoU > 0.3 " in text
+    assert "1 true pair: IoU of the observed ground > 0.3 " in text
     assert "1.00 (1.00-1.00)" in text
 
 
-def test_evaluate_in_words(ok, run, mission_folder):
+def test_evaluate_leads_with_what_is_right(ok, run, mission_folder, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
     text = in_one_line(ok("evaluate", run, "--truth", mission_folder / "truth.tum"))
-    assert "4 pairs scored, 1 of them true" in text
+    assert text.startswith("1 loop accepted: 1 right, 0 wrong by pose (within 0.")
+    assert "Found 1 of 1 pair that share over 30 % of their ground (bounding-box IoU). Closed 1 of 1" in text
+    assert "R@1 1.00 (1 of 1), P@1 1.00 (1 of 1)" in text
+    assert "Within 2 m and 5 deg: 100.0 % of the accepted loops; yaw within 10 deg: 100.0 %" in text
+    assert "4 pairs evaluated; 2 left out: consecutive submaps." in text
+    assert text.index("right by") > text.index("precision by pose") > text.index("R@1")
     assert ok("evaluate", run, "--truth", mission_folder / "truth.tum", "-q") == ""
+
+
+def test_evaluate_with_other_tolerances(ok, run, mission_folder):
+    arguments = ["evaluate", run, "--truth", mission_folder / "truth.tum", "--json"]
+    told = json.loads(ok(*arguments))
+    strict = json.loads(ok(*arguments, "--position-tolerance", 1e-6))
+    loose = json.loads(ok(*arguments, "--position-tolerance", 2.5, "--yaw-tolerance", 30))
+    assert [found["accepted_right_pose"] for found in (told, strict, loose)] == [1, 0, 1]
+    assert [found["position_tolerance_m"] for found in (strict, loose)] == [1e-6, 2.5]
+    assert loose["yaw_tolerance_deg"] == pytest.approx(30)
+
+
+def test_evaluate_without_pairs(ok, run, mission_folder, tmp_path):
+    file = tmp_path / "sessions.csv"
+    file.write_text("cloud,session\n" + "".join(f"{name},one\n" for name in PLACES))
+    arguments = ["evaluate", run, "--truth", mission_folder / "truth.tum", "--sessions", file]
+    assert in_one_line(ok(*arguments)).startswith("Nothing to evaluate: 0 pairs evaluated; 6 left out")
+    assert json.loads(ok(*arguments, "--json"))["retrieval"][0]["recall_at_one"] is None
+
+
+@pytest.mark.parametrize("columns", [20, 30, 47, 80, 200])
+def test_evaluate_cuts_no_number(ok, run, mission_folder, monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    text = ok("evaluate", run, "--truth", mission_folder / "truth.tum", "--clouds", mission_folder)
+    assert "\N{HORIZONTAL ELLIPSIS}" not in text
+    lines = [
+        [cell.strip() for cell in line.split("\N{BOX DRAWINGS LIGHT VERTICAL}")] for line in text.splitlines()
+    ]
+    rows = [cells for cells in lines if len(cells) > 1]
+    written = rows_of(run / "precision_recall.csv")
+    assert [row[:3] for row in rows[: len(written)]] == [
+        [row["min_score"], row["right_poses"], row["wrong_poses"]] for row in written
+    ]
+    assert all(len(row) == 7 for row in rows[: len(written)])
+    assert [row[0] for row in rows[len(written) :]] == 2 * ["pose", "overlap and pose", "overlap"]
+    assert all("1.00 (1.00-1.00)" in row for row in rows[len(written) :])
+
+
+@pytest.mark.parametrize("columns", range(20, 201, 15))
+def test_tables_show_every_cell_at_any_width(columns):
+    heads = ["a long heading", "Geschwindigkeitsbegrenzung", "n", "deg >="]
+    rows = [["0.71 (0.50-1.00)", "-12.345", "7", "1e-12"], ["[red]", "1", "123456789012", "x [/b]"]]
+    console = console_of(io.StringIO())
+    console.width = columns
+    console.print(table_of("A [title] that is longer than the terminal is wide", heads, rows))
+    lines = console.file.getvalue().splitlines()
+    body = [[cell.strip() for cell in line.split("\N{BOX DRAWINGS LIGHT VERTICAL}")] for line in lines]
+    assert [cells for cells in body if len(cells) == 4] == rows
+    assert set(" ".join(heads).split()) <= set(" ".join(lines).split())
 
 
 def test_evaluate_leaves_out_pairs_of_one_session(ok, run, mission_folder, tmp_path):
@@ -487,6 +527,13 @@ def test_demo_runs(ok, tmp_path, fast_default):
     for picture in told["pictures"]:
         assert Path(picture).read_bytes().startswith(b"\x89PNG")
     assert rows_of(output / "submaps.csv")
+
+
+def test_without_matplotlib_the_demo_runs_and_names_the_extra(ok, tmp_path, fast_default, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    told = ok("demo", "-o", tmp_path, "--submaps", 3, "--workers", 1, "--world", "flat")
+    assert 'Pictures: none; matplotlib is missing: pip install "terrainloop[figures]"' in in_one_line(told)
+    assert not list(tmp_path.glob("*.png"))
 
 
 # --- what cannot be worked with
@@ -583,7 +630,61 @@ def test_evaluate_with_clouds_of_another_mission(refused, run, mission_folder, t
     arguments = ["evaluate", run, "--truth", mission_folder / "truth.tum", "--clouds", tmp_path]
     assert "clouds" in refused(*arguments)
     shutil.copy(cloud(mission_folder, "000000"), tmp_path / "clouds")
-    assert "found 1 cloud;" in refused(*arguments)
+    assert "found 1 there;" in refused(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "named"),
+    [
+        ("pairs.csv", lambda row: row | {"source": "nobody"}, "no 'nobody'"),
+        ("pairs.csv", lambda row: row | {"source": row["target"]}, "two different submaps"),
+        ("pairs.csv", lambda row: row | {"source": BROKEN}, "broken"),
+        ("pairs.csv", lambda row: row | {"score": "nan"}, "found nan"),
+        ("pairs.csv", lambda row: row | {"score": "inf"}, "found inf"),
+        ("pairs.csv", lambda row: row | {"tx_m": "inf"}, "rigid transform"),
+        ("pairs.csv", lambda row: row | {"tz_m": "-1e300"}, "rigid transform"),
+        ("pairs.csv", lambda row: row | {"yaw_rad": "inf"}, "rigid transform"),
+        ("pairs.csv", lambda row: row | {"pitch_rad": "nan"}, "rigid transform"),
+        ("submaps.csv", lambda row: row | {"name": "000000"}, "'000000'"),
+        ("submaps.csv", lambda row: row | {"hull_m": "POLYGON ((0 0, 1 0, 0 0))"}, "three or more"),
+        ("submaps.csv", lambda row: row | {"hull_m": "POLYGON ((0 0, 1 0, nan 1, 0 0))"}, "three or more"),
+        ("submaps.csv", lambda row: row | {"hull_m": ""}, "three or more"),
+    ],
+)
+def test_evaluate_of_a_damaged_run(refused, run, mission_folder, file, change, named):
+    """The last line is damaged, or repeated."""
+    rows = rows_of(run / file)
+    rows[-1] = change(rows[-1])
+    write_rows(run / file, rows)
+    assert named in refused("evaluate", run, "--truth", mission_folder / "truth.tum")
+    assert not (run / "precision_recall.csv").exists()
+
+
+def test_evaluate_of_a_pair_that_repeats(refused, run, mission_folder):
+    rows = rows_of(run / "pairs.csv")
+    write_rows(run / "pairs.csv", [*rows, rows[0]])
+    assert "every pair once" in refused("evaluate", run, "--truth", mission_folder / "truth.tum")
+
+
+def test_evaluate_by_a_truth_with_w_first(refused, run, mission_folder, tmp_path):
+    lines = (mission_folder / "truth.tum").read_text().splitlines()
+    rows = [line.split() for line in lines if not line.startswith("#")]
+    turned = [[*row[:4], row[7], *row[4:7]] for row in rows]
+    (tmp_path / "turned.tum").write_text("".join(" ".join(row) + "\n" for row in turned))
+    assert "w first" in refused("evaluate", run, "--truth", tmp_path / "turned.tum")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--position-tolerance", "0"],
+        ["--position-tolerance", "nan"],
+        ["--yaw-tolerance", "-5"],
+        ["--yaw-tolerance", "inf"],
+    ],
+)
+def test_evaluate_by_numbers_that_are_none(refused, run, mission_folder, options):
+    refused("evaluate", run, "--truth", mission_folder / "truth.tum", *options)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,8 @@
 """Settings: to YAML and back, errors that name file and key, and the paper's published numbers."""
 
+import os
+import subprocess
+import sys
 from typing import get_args
 
 import numpy as np
@@ -48,7 +51,7 @@ def test_presets_survive_yaml(preset, file):
 def test_changed_settings_survive_yaml(file):
     settings = Settings(
         map=MapSettings(length_scale=1e-5 + 0.25, noise=1e-7, fit="submap"),
-        match=MatchSettings(max_ssd_ratio=1 / 3, inlier_radius=12345.678),
+        match=MatchSettings(max_ssd_ratio=1 / 3, inlier_radius=1234.5678),
         skip_recent=0,
         seed=2**40,
     )
@@ -129,9 +132,92 @@ def test_no_yaml_is_refused(file, content):
     refusal(file)
 
 
+@pytest.mark.parametrize(
+    ("content", "key"),
+    [
+        ("seed: 2021-13-41", "seed"),
+        ("seed: 2020-01-01", "seed"),
+        ("map: {noise: '0.1'}", "map.noise"),
+        ("features: {max_keypoints: true}", "features.max_keypoints"),
+        ("map: {length_scale: false}", "map.length_scale"),
+        ("map: {remove_plane: yes}", "map.remove_plane"),
+        ("map: {remove_plane: 1}", "map.remove_plane"),
+        ("seed: 1.0", "seed"),
+        ("match: {iterations: 1:30}", "match.iterations"),
+        ("map: {noise: 1e300}", "map.noise"),
+        ("map: {resolution: 1e-300}", "map.resolution"),
+        ("match: {inlier_radius: 1e400}", "match.inlier_radius"),
+        ("seed: 18446744073709551616", "seed"),
+        (f"map: {{length_scale: {'9' * 4000}}}", "map.length_scale"),
+        ("features: {max_keypoints: 99999999999}", "features.max_keypoints"),
+        ("map: !!binary aGVsbG8=", "map"),
+        ("match: !!set {a, b}", "match"),
+        ("'speed limit': 1", "speed limit"),
+        (f"{'x' * 1000}: 1", "xxx"),
+        ('"a\\nb\\e[31m": 1', "ab[31m:"),
+    ],
+)
+def test_values_of_another_type_or_size_are_refused_by_key(file, content, key):
+    file.write_text(content + "\n")
+    message = refusal(file)
+    assert f"found {key}" in message
+    assert len(message) < 500
+
+
+REFUSED_YAML = {
+    "brackets": "[" * 5000,
+    "braces": "{a: " * 3000,
+    "dashes": "- " * 2000,
+    "nested by indent": "".join(f"{' ' * i}a:\n" for i in range(200)),
+    "digits": f"seed: {'7' * 6000}",
+    "references": "a: &a [1, 2]\nb: [*a, *a]",
+    "reference to itself": "a: &a [*a]",
+    "merge": "map: {<<: &m {noise: 0.1}}",
+    "twice": "seed: 1\nmap: {}\nseed: 2",
+    "twice within": "match:\n  iterations: 5\n  iterations: 6",
+    "twice, quoted": "seed: 1\n'seed': 2",
+    "tab": "map:\n\tnoise: 0.1",
+    "null byte": "seed: 1\0",
+    "two documents": "seed: 1\n---\nseed: 2",
+    "object": "seed: !!python/object/apply:os.getcwd []",
+    "date": "seed: !!timestamp 2020-99-99",
+    "large": "# nothing but a comment\n" * 100_000,
+    "list as a key": "? [1, 2]\n: 3",
+}
+
+
+@pytest.mark.parametrize("case", REFUSED_YAML)
+def test_yaml_that_settings_do_not_need_is_refused(file, case):
+    file.write_text(REFUSED_YAML[case])
+    assert len(refusal(file)) < 500
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda path: path.symlink_to("/dev/zero")])
+def test_only_regular_files_are_opened(file, make):
+    make(file)
+    assert "not a regular file" in refusal(file)
+
+
+def test_numbers_are_those_of_yaml_1_2(file):
+    file.write_text("map: {noise: 1e-3, length_scale: 2, resolution: +.5E0}\nseed: 010\nskip_recent: 0\n")
+    settings = Settings.from_yaml(file)
+    assert (settings.map.noise, settings.map.length_scale, settings.map.resolution) == (0.001, 2.0, 0.5)
+    assert (settings.seed, settings.skip_recent) == (10, 0)
+
+
+def test_comments_do_not_come_from_docstrings():
+    script = "from terrainloop.config import Settings; print(Settings().to_yaml(), end='')"
+    stripped = subprocess.run(
+        [sys.executable, "-OO", "-c", script], check=True, capture_output=True, text=True
+    )
+    assert stripped.stdout == Settings().to_yaml()
+    assert "None" not in stripped.stdout
+
+
 def test_no_file_is_refused(tmp_path):
     refusal(tmp_path / "absent.yaml")
     refusal(tmp_path)
+    refusal(None)
 
 
 def test_unknown_preset_is_refused():

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import with_pixels
 
 from terrainloop import field as fields_module
 from terrainloop.config import Calibration
@@ -40,7 +41,7 @@ def scaled(gradient_map, *, heights=1.0, metres=1.0):
         gradient_map,
         gradient_x=np.float32(heights) * gradient_map.gradient_x,
         gradient_y=np.float32(heights) * gradient_map.gradient_y,
-        gradient_variance=np.float32(heights**2) * gradient_map.gradient_variance,
+        gradient_variance=np.float32(heights**2 or 1e-12) * gradient_map.gradient_variance,
         origin=tuple(metres * c for c in gradient_map.origin),
         resolution=metres * gradient_map.resolution,
         parameters=parameters,
@@ -160,7 +161,8 @@ def test_flat_ground_beside_unknown_slopes_has_no_field(terrain):
 def test_a_boulder_does_not_decide(world):
     """Ground without and with one steep rock still agrees, though the rock holds nearly all the energy."""
     plain, other = world(0).map(**BIG), world(0).map(**BIG)
-    other.gradient_x[40:46, 40:46] += 10.0
+    rock = np.s_[40:46, 40:46]
+    other = with_pixels(other, rock, gradient_x=other.gradient_x[rock] + 10.0)
     assert (plain.gradient_x**2).sum() < 0.3 * (other.gradient_x**2).sum()
     fields = field_of(plain, SPACING), field_of(other, SPACING)
     assert agreement_at(*fields, np.eye(3)).correlation > 0.85
@@ -168,12 +170,15 @@ def test_a_boulder_does_not_decide(world):
 
 def test_uncertain_gradients_count_less(world):
     """One half of the map is noise, and known to be."""
-    plain, noisy = world(0).map(**BIG), world(0).map(**BIG)
+    plain = world(0).map(**BIG)
     noise = np.random.default_rng(0).normal(0, 1.0, (2, 50, 100)).astype(np.float32)
-    noisy.gradient_x[50:] += noise[0]
-    noisy.gradient_y[50:] += noise[1]
-    told = replace(noisy, gradient_variance=noisy.gradient_variance.copy())
-    told.gradient_variance[50:] = 1.0
+    half = np.s_[50:]
+    slopes = {
+        "gradient_x": plain.gradient_x[half] + noise[0],
+        "gradient_y": plain.gradient_y[half] + noise[1],
+    }
+    noisy = with_pixels(plain, half, **slopes)
+    told = with_pixels(noisy, half, gradient_variance=1.0)
     field = field_of(plain, SPACING)
     unaware, aware = (agreement_at(field_of(m, SPACING), field, np.eye(3)).correlation for m in (noisy, told))
     assert aware > unaware + 0.05

@@ -1,14 +1,18 @@
 """Every figure makes a picture, also of what went wrong, without a warning and the same each time."""
 
+import sys
 from dataclasses import replace
+from importlib import import_module
 
 import cv2
 import numpy as np
 import pytest
 from conftest import STRICT
+from evaluation_util import right, write_run, wrong
 
 from terrainloop.entry import MapEntry
-from terrainloop.evaluation.precision_recall import OperatingPoint
+from terrainloop.errors import TerrainLoopError
+from terrainloop.evaluation.summary import evaluate_run
 from terrainloop.features import extract_features
 from terrainloop.geometry import se2, se3
 from terrainloop.loop import LoopCandidate
@@ -88,6 +92,11 @@ def test_map(submap, source, tmp_path):
     image = pictures(lambda: figure_map(submap, source), tmp_path)
     assert drawn_share(image) > 0.25
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 300  # colour maps, not just text
+
+
+def test_a_map_draws_itself(source, tmp_path):
+    image = pictures(source.plot, tmp_path)
+    assert drawn_share(image) > 0.25
 
 
 def test_map_of_unknown_ground(submap, source, tmp_path):
@@ -175,33 +184,45 @@ def test_mission_of_one_submap(tmp_path):
     assert drawn_share(image) > 0.01
 
 
-CURVE = [OperatingPoint(float(n), 10 - n // 2, max(0, 8 - n), n // 2) for n in range(1, 21)]
-
-
 @pytest.mark.parametrize(
-    "points",
+    "pairs",
     [
-        CURVE,
-        CURVE[:1],
-        [OperatingPoint(float(n), 0, 0, 0) for n in range(1, 5)],  # nothing true, nothing found
-        [OperatingPoint(1.0, 0, 3, 2), OperatingPoint(2.0, 0, 0, 2)],
+        [right("d", "a"), wrong("e", "a")],
+        [right("d", "a")],
+        [wrong("e", "b")],  # nothing true, nothing found
+        [right("d", "a", accepted=False)],
+        [],
     ],
-    ids=["curve", "one point", "no pairs", "nothing found"],
 )
-def test_precision_recall(points, tmp_path):
-    def draw():
-        return figure_precision_recall(points, "IoU > 0.3", "least score", {"by pose": points[::-1]})
-
-    assert drawn_share(pictures(draw, tmp_path)) > 0.005
+def test_precision_recall(pairs, tmp_path):
+    evaluation = evaluate_run(tmp_path, write_run(tmp_path, pairs))
+    assert drawn_share(pictures(lambda: figure_precision_recall(evaluation), tmp_path)) > 0.005
 
 
 def test_curves_of_precision_and_recall_are_drawn_in_steps(tmp_path):
-    """The area beneath a curve is its average precision."""
-    steps = [OperatingPoint(9.0, 1, 0, 1), OperatingPoint(5.0, 1, 3, 1), OperatingPoint(4.0, 2, 3, 0)]
-    figure = figure_precision_recall(steps[:1], "IoU > 0.3", "least score", {"a": steps, "none": []})
-    line, empty, dots = figure.axes[0].get_lines()
-    assert line.get_drawstyle() == "steps-pre"
-    recall, precision = line.get_xdata(), line.get_ydata()
-    assert np.diff(recall) @ precision[1:] == pytest.approx((1 + 2 / 5) / 2)
-    assert len(empty.get_xdata()) == 0
-    assert (dots.get_xdata(), dots.get_ydata()) == ([0.5], [1.0])
+    """The area beneath a curve is its average precision; the mark is at the accepted loops."""
+    pairs = [
+        right("d", "a", score=9.0, accepted=False),
+        wrong("e", "a", score=12.0),
+        wrong("e", "b", score=2.0),
+    ]
+    evaluation = evaluate_run(tmp_path, write_run(tmp_path, pairs))
+    curves, by_threshold = figure_precision_recall(evaluation).axes
+    by_pose, *_, accepted = curves.get_lines()
+    assert by_pose.get_drawstyle() == "steps-pre"
+    recall, precision = by_pose.get_xdata(), by_pose.get_ydata()
+    assert np.diff(recall) @ precision[1:] == pytest.approx(1 / 2)
+    assert (accepted.get_xdata(), accepted.get_ydata()) == ([0.0], [0.0])
+    drawn = by_threshold.get_lines()[0].get_ydata()
+    np.testing.assert_array_equal(drawn, [row["pose_precision"] for row in evaluation.table])
+
+
+def test_without_matplotlib_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    for name in [
+        *filter(lambda name: name.startswith("matplotlib."), sys.modules),
+        "terrainloop.report.figures",
+    ]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(TerrainLoopError, match=r"expected matplotlib.*terrainloop\[figures\]"):
+        import_module("terrainloop.report.figures")

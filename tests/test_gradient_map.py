@@ -1,11 +1,16 @@
 """Gradient maps: where a pixel lies, what the contract promises, and files."""
 
-from dataclasses import fields
+import io
+import os
+import pickle
+import zipfile
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from terrainloop.errors import TerrainLoopError
+from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.gradient_map import GradientMap
 from terrainloop.submap import Submap
 
@@ -243,6 +248,48 @@ def other_archive(path):
     np.savez(path, points=np.zeros((10, 3)))
 
 
+def spoilt(**changes):
+    """A file in which some arrays are others."""
+
+    def spoil(path):
+        with np.load(path) as file:
+            content = dict(file)
+        np.savez(path, **content | {name: make(content[name]) for name, make in changes.items()})
+
+    return spoil
+
+
+def packed_otherwise(path):
+    with zipfile.ZipFile(path) as archive:
+        content = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as archive:
+        for name, data in content.items():
+            archive.writestr(name, data)
+
+
+def announced_large(path):
+    """A header that announces more than there is, as in a file made to exhaust the memory."""
+    with zipfile.ZipFile(path) as archive:
+        content = {name: archive.read(name) for name in archive.namelist()}
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f4", "fortran_order": False, "shape": (10**6, 10**6)}
+    )
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in content.items():
+            archive.writestr(name, header.getvalue() if name == "elevation.npy" else data)
+
+
+def pipe(path):
+    path.unlink()
+    os.mkfifo(path)
+
+
+def folder(path):
+    path.unlink()
+    path.mkdir()
+
+
 def words(path):
     path.write_text("no map")
 
@@ -274,6 +321,30 @@ def no_file(path):
         no_file,
         half_a_map,
         plain_array,
+        packed_otherwise,
+        announced_large,
+        pipe,
+        folder,
+        spoilt(parameters=lambda p: p * [0, 1, 1]),
+        spoilt(parameters=lambda p: p * [-1, 1, 1]),
+        spoilt(parameters=lambda p: p * [1e-6, 1, 1]),
+        spoilt(parameters=lambda p: p * [1, np.nan, 1]),
+        spoilt(parameters=lambda p: p[:2]),
+        spoilt(parameters=lambda p: np.array(list(p), dtype=object)),
+        spoilt(resolution=lambda r: 0 * r),
+        spoilt(resolution=lambda r: np.array([r, r])),
+        spoilt(resolution=lambda r: np.float64(np.inf)),
+        spoilt(origin=lambda o: o * np.nan),
+        spoilt(origin=lambda o: o[:1]),
+        spoilt(elevation=lambda e: e[:-1]),
+        spoilt(elevation=lambda e: e.astype(np.float64)),
+        spoilt(elevation=lambda e: e[None]),
+        spoilt(gradient_x=lambda g: np.where(g == g.max(), np.float32(np.nan), g)),
+        spoilt(gradient_y=lambda g: np.where(g == g.max(), np.float32(1e30), g)),
+        spoilt(variance=lambda v: 0 * v),
+        spoilt(gradient_variance=lambda v: -v),
+        spoilt(mask=lambda m: m.astype(np.uint8)),
+        spoilt(**{name: lambda a: a[:0] for name in (*(n for n in ARRAYS if n != "magnitude"), "mask")}),
     ],
 )
 def test_what_is_no_map_is_an_error(tmp_path, bumpy, spoil):
@@ -284,6 +355,77 @@ def test_what_is_no_map_is_an_error(tmp_path, bumpy, spoil):
         GradientMap.load(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400 + len(str(path))
+
+
+def test_a_map_is_saved_whole_or_not_at_all(tmp_path, bumpy, monkeypatch):
+    bumpy.save(tmp_path / "map.npz")
+    before = (tmp_path / "map.npz").read_bytes()
+
+    def full_disk(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full_disk)
+    with pytest.raises(OSError, match="space"):
+        bumpy.save(tmp_path / "map.npz")
+    assert [file.name for file in tmp_path.iterdir()] == ["map.npz"]
+    assert (tmp_path / "map.npz").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"elevation": None}, "elevation"),
+        ({"mask": np.ones((3, 3), int)}, "booleans"),
+        ({"variance": np.ones((3, 3), np.float32)}, "one shape"),
+        ({"gradient_x": "file.npz"}, "gradient_x"),
+        ({"resolution": 0.0}, "positive"),
+        ({"resolution": "0.1"}, "resolution"),
+        ({"origin": (0.0, np.nan)}, "origin"),
+        ({"origin": None}, "origin"),
+        ({"parameters": (0.4, 0.1, 0.01)}, "Hyperparameters"),
+        ({"parameters": Hyperparameters(0.4, 0.1, 0.0)}, "positive"),
+        ({"parameters": Hyperparameters(1e-9, 0.1, 0.1)}, "squares of the length scale"),
+        ({"parameters": Hyperparameters(1e6, 0.1, 0.1)}, "pixels within a length scale"),
+        ({"resolution": 1e-9}, "pixels within a length scale"),
+    ],
+)
+def test_maps_made_by_hand_are_checked(bumpy, changes, said):
+    with pytest.raises(TerrainLoopError, match=said):
+        replace(bumpy, **changes)
+
+
+def test_images_of_a_map_by_hand_may_be_double(bumpy):
+    again = replace(bumpy, elevation=bumpy.elevation.astype(np.float64))
+    assert again.elevation.dtype == np.float32
+    assert same_bytes(again, bumpy)
+
+
+def test_arrays_are_read_only_and_the_callers_stay_as_they_are(tmp_path, bumpy):
+    own = bumpy.elevation.copy()
+    made = replace(bumpy, elevation=own)
+    assert np.shares_memory(made.elevation, own)
+    own[0, 0] = 1.0
+    bumpy.save(tmp_path / "map.npz")
+    for each in (made, GradientMap.load(tmp_path / "map.npz"), pickle.loads(pickle.dumps(bumpy))):
+        for name in (*ARRAYS, "mask"):
+            with pytest.raises(ValueError, match="read-only"):
+                getattr(each, name)[0, 0] = 0
+
+
+def test_extent_is_that_of_the_pixels(bumpy):
+    grid = grid_of(bumpy)
+    low, high = grid[0, 0] - bumpy.resolution / 2, grid[-1, -1] + bumpy.resolution / 2
+    np.testing.assert_allclose(bumpy.extent, [low[0], high[0], low[1], high[1]], rtol=0, atol=1e-12)
+    assert [type(edge) for edge in bumpy.extent] == 4 * [float]
+
+
+def test_a_map_describes_itself_in_a_line(bumpy):
+    rows, columns = bumpy.mask.shape
+    share = round(100 * bumpy.mask.mean())
+    assert repr(bumpy) == (
+        f"GradientMap({columns} x {rows} pixels of 0.1 m, {share} % observed, length scale 0.4 m)"
+    )
 
 
 def test_masts_and_flying_pixels_are_no_terrain(cloud, bumpy):

@@ -10,7 +10,7 @@ from clouds_util import DATA, UTM, ground
 from pypcd4 import Encoding, PointCloud
 
 from terrainloop.errors import TerrainLoopError
-from terrainloop.io import CLOUD_SUFFIXES, read_cloud, write_cloud
+from terrainloop.io.clouds import CLOUD_SUFFIXES, read_cloud, read_crs, write_cloud
 
 POINTS = ground() + UTM
 SMALL = ground().astype(np.float32)
@@ -78,6 +78,52 @@ PLY = {
         _properties("double"),
         after=FACE_HEADER.replace("face 10", "face 0"),
     ),
+    "faces before the vertices": _ply(
+        "binary_little_endian", FACES + POINTS.tobytes(), _properties("double"), before=FACE_HEADER
+    ),
+    "ascii, faces before the vertices": _ply(
+        "ascii",
+        ("3 0 1 2\n4 0 1 2 3\n" * 5 + _lines(POINTS)).encode(),
+        _properties("double"),
+        before=FACE_HEADER,
+    ),
+    "lists among the coordinates": _ply(
+        "binary_big_endian",
+        b"".join(
+            struct.pack(f">dB{i % 4}hddi0f", x, i % 4, *[7] * (i % 4), y, z, 0)
+            for i, (x, y, z) in enumerate(POINTS.tolist())
+        ),
+        "property double x\nproperty list uchar short seen_by\nproperty double y\nproperty double z\n"
+        "property list int float weights\n",
+    ),
+    "ascii, lists among the coordinates": _ply(
+        "ascii",
+        "".join(
+            f"{i % 3} {'9 ' * (i % 3)}{x!r} {y!r} 1 0 {z!r}\n" for i, (x, y, z) in enumerate(POINTS.tolist())
+        ).encode(),
+        "property list uchar int seen_by\nproperty double x\nproperty double y\n"
+        "property list uchar int n\nproperty double z\n",
+    ),
+    "ascii, blank lines and comments": _ply(
+        "ascii",
+        ("\n  \n" + _lines(POINTS).replace("\n", "\n\n# 1 2 3\ncomment 4 5 6\n")).encode(),
+        _properties("double"),
+    ),
+    "ascii with CR CR LF": _ply(
+        "ascii", _lines(POINTS).replace("\n", "\r\r\n").encode(), _properties("double"), newline="\r\r\n"
+    ),
+    "ascii with CR": _ply(
+        "ascii", _lines(POINTS).replace("\n", "\r").encode(), _properties("double"), newline="\r"
+    ),
+    "binary below CR": _ply(
+        "binary_little_endian",
+        struct.pack("<i", 10) + POINTS.tobytes(),
+        _properties("double"),
+        before="element note 1\nproperty int n\n",
+        newline="\r",
+    ),
+    "padding behind": _ply("binary_little_endian", POINTS.tobytes() + bytes(4096), _properties("double")),
+    "upper case": _ply("ASCII", _lines(POINTS).encode(), _properties("DOUBLE", "XYZ")),
     "a camera before the vertices": _ply(
         "binary_little_endian",
         struct.pack("<2f", 1, 2) + POINTS.tobytes(),
@@ -156,6 +202,183 @@ def test_pcd_by_hand_with_unorganised_blanks(tmp_path):
         header + _lines(POINTS, INTENSITY).replace(" ", "  ").replace("\n", " \n")
     )
     assert np.array_equal(read_cloud(tmp_path / "a.pcd").points, POINTS)
+
+
+PCD_HEADER = """# .PCD v0.7
+VERSION 0.7
+FIELDS x y z
+SIZE 8 8 8
+TYPE F F F
+COUNT 1 1 1
+WIDTH 400
+HEIGHT 1
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS 400
+DATA ascii
+"""
+PCD = {
+    "no COUNT": (PCD_HEADER.replace("COUNT 1 1 1\n", ""), ""),
+    "no VIEWPOINT": (PCD_HEADER.replace("VIEWPOINT 0 0 0 1 0 0 0\n", ""), ""),
+    "no POINTS": (PCD_HEADER.replace("POINTS 400\n", ""), ""),
+    "no WIDTH and HEIGHT": (PCD_HEADER.replace("WIDTH 400\nHEIGHT 1\n", ""), ""),
+    "no VERSION": (PCD_HEADER.replace("VERSION 0.7\n", ""), ""),
+    "organised": (PCD_HEADER.replace("WIDTH 400\nHEIGHT 1\n", "WIDTH 20\nHEIGHT 20\n"), ""),
+    "lower case": (PCD_HEADER.replace("F F F", "f f f"), ""),
+    "upper case": (PCD_HEADER.replace("ascii", "ASCII").replace("x y z", "X Y Z"), ""),
+    "COLUMNS": (PCD_HEADER.replace("FIELDS", "COLUMNS"), ""),
+    "several values of a field": (
+        PCD_HEADER.replace("x y z", "x _ y _ z").replace("8 8 8", "8 4 8 4 8").replace("F F F", "F F F U F")
+        .replace("1 1 1\n", "1 3 1 2 1\n"),
+        "",
+    ),
+    "blank lines": (PCD_HEADER, "\n\n"),
+    "CR CR LF": (PCD_HEADER.replace("\n", "\r\r\n"), "\r\r\n"),
+    "comments": (PCD_HEADER, "\n# 1 2 3\n"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", PCD)
+def test_pcd_as_others_write_it(tmp_path, case):
+    header, newline = PCD[case]
+    more = [INTENSITY] * 3 + [INTENSITY] * 2 if "several" in case else []
+    x, y, z = POINTS.T
+    body = _lines(x, *more[:3], y, *more[3:], z).replace("\n", newline or "\n")
+    (tmp_path / "a.pcd").write_bytes((header + body).encode())
+    assert np.array_equal(read_cloud(tmp_path / "a.pcd").points, POINTS)
+
+
+@pytest.mark.parametrize("data", ["binary", "BINARY"])
+def test_pcd_with_several_values_of_a_field(tmp_path, data):
+    records = np.zeros(400, [("x", "<f8"), ("_", "<u2", (5,)), ("y", "<f8"), ("z", "<f8")])
+    records["x"], records["y"], records["z"] = POINTS.T
+    header = PCD_HEADER.replace("x y z", "x _ y z").replace("8 8 8", "8 2 8 8").replace("F F F", "F U F F")
+    header = header.replace("1 1 1\n", "1 5 1 1\n").replace("ascii", data)
+    (tmp_path / "a.pcd").write_bytes(header.encode() + records.tobytes())
+    assert np.array_equal(read_cloud(tmp_path / "a.pcd").points, POINTS)
+
+
+@pytest.mark.parametrize("body", ["nan nan nan", "1 2 1.#QNAN", "1.#IND 2 3", "1 -nan(ind) 3", "1 2 1e999"])
+@pytest.mark.parametrize("suffix", ["ply", "pcd"])
+def test_points_that_are_no_numbers_are_dropped_openly(tmp_path, suffix, body):
+    text = _lines(POINTS[:-1]) + body + "\n"
+    content = (
+        _ply("ascii", text.encode(), _properties("double"))
+        if suffix == "ply"
+        else (PCD_HEADER + text).encode()
+    )
+    (tmp_path / f"a.{suffix}").write_bytes(content)
+    submap = read_cloud(tmp_path / f"a.{suffix}")
+    assert np.array_equal(submap.points, POINTS[:-1])
+    assert "dropped 1 of 400 points: not finite" in submap.repairs
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+@pytest.mark.parametrize("point_format", [1, 6, 8])
+def test_las_drops_noise_and_what_is_withheld(tmp_path, suffix, point_format):
+    header = laspy.LasHeader(version="1.4", point_format=point_format)
+    header.scales = [0.001] * 3
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = ground().T
+    kind = np.resize([2, 1, 12, 17], 400)  # ground, unclassified, overlap, bridge
+    kind[:20], kind[20:30] = 7, 18
+    las.classification = kind
+    las.withheld = (np.arange(400) >= 10) & (np.arange(400) < 12) | (np.arange(400) >= 382)
+    las.synthetic = np.arange(400) % 2
+    las.intensity = INTENSITY
+    las.write(tmp_path / f"a.{suffix}")
+    submap = read_cloud(tmp_path / f"a.{suffix}")
+    assert np.array_equal(submap.intensity, INTENSITY[30:382])
+    assert set(submap.repairs) == {
+        "dropped 20 of 400 points: withheld",
+        "dropped 28 of 400 points: classified as noise (7, 18)",
+    }
+
+
+def test_las_of_noise_alone_says_why_nothing_is_left(tmp_path):
+    las = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
+    las.x, las.y, las.z = ground().T
+    las.classification = np.full(400, 7, np.uint8)
+    las.write(tmp_path / "a.las")
+    with pytest.raises(TerrainLoopError, match="dropped 400 of 400 points: classified as noise"):
+        read_cloud(tmp_path / "a.las")
+
+
+@pytest.mark.parametrize("point_format", [3, 6])
+def test_streamed_laz(tmp_path, point_format):
+    content = _las("laz", point_format)
+    (start,) = struct.unpack_from("<I", content, 96)
+    (table,) = struct.unpack_from("<q", content, start)
+    (tmp_path / "a.laz").write_bytes(_poked(content, start, "<q", -1) + struct.pack("<q", table))
+    (tmp_path / "b.laz").write_bytes(content)
+    assert np.array_equal(read_cloud(tmp_path / "a.laz").points, read_cloud(tmp_path / "b.laz").points)
+
+
+UTM_WKT = (
+    'PROJCS["WGS 84 / UTM zone 11N",GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.25]],'
+    'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433],AUTHORITY["EPSG","4326"]],'
+    'PROJECTION["Transverse_Mercator"],UNIT["metre",1,AUTHORITY["EPSG","9001"]]{}]'
+)
+NAMED_UTM = UTM_WKT.format(',AUTHORITY["EPSG","32611"]')
+HEIGHTS = 'VERT_CS["NAVD88",VERT_DATUM["NAVD88",2005],UNIT["metre",1],AUTHORITY["EPSG","5703"]]'
+CRS = {
+    "none": ({}, None),
+    "keys": ({34735: [1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, 26911]}, 26911),
+    "own keys": ({34735: [1, 1, 0, 1, 3072, 0, 1, 32767]}, None),
+    "WKT with a code": ({2112: NAMED_UTM}, 32611),
+    "WKT 2": ({2112: 'PROJCRS["x",BASEGEOGCRS["y",ID["EPSG",4326]],ID["EPSG",32611]]'}, 32611),
+    "WKT without": ({2112: UTM_WKT.format("")}, UTM_WKT.format("")),
+    "with heights": ({2112: f'COMPD_CS["a",{NAMED_UTM},{HEIGHTS}]'}, 32611),
+}
+
+
+def _las_with(records, suffix="las"):
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    for number, content in records.items():
+        data = content.encode() + b"\0" if number == 2112 else np.array(content, "<u2").tobytes()
+        header.vlrs.append(laspy.VLR("LASF_Projection", number, "", data))
+    header.scales = [0.001] * 3
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = ground().T
+    file = io.BytesIO()
+    las.write(file, do_compress=suffix == "laz")
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+@pytest.mark.parametrize("case", CRS)
+def test_coordinate_reference_system_of_las(tmp_path, case, suffix):
+    records, crs = CRS[case]
+    path = tmp_path / f"a.{suffix}"
+    path.write_bytes(_las_with(records, suffix))
+    assert read_crs(path) == crs
+    assert len(read_cloud(path)) == 400
+
+
+NO_METRES = {
+    "geographic keys": {34735: [1, 1, 0, 2, 1024, 0, 1, 2, 2048, 0, 1, 4326]},
+    "geocentric keys": {34735: [1, 1, 0, 1, 1024, 0, 1, 3]},
+    "US survey feet": {34735: [1, 1, 0, 3, 1024, 0, 1, 1, 3072, 0, 1, 2229, 3076, 0, 1, 9003]},
+    "heights in feet": {34735: [1, 1, 0, 3, 1024, 0, 1, 1, 3072, 0, 1, 26911, 4099, 0, 1, 9002]},
+    "geographic WKT": {2112: 'GEOGCS["WGS 84",UNIT["degree",0.01745],AUTHORITY["EPSG","4326"]]'},
+    "geographic compound": {2112: f'COMPD_CS["a",GEOGCS["WGS 84"],{HEIGHTS}]'},
+    "feet in WKT": {2112: NAMED_UTM.replace('UNIT["metre"', 'UNIT["US survey foot"')},
+}
+
+
+@pytest.mark.parametrize("case", NO_METRES)
+def test_las_that_states_other_units_than_metres_is_refused(tmp_path, case):
+    (tmp_path / "a.las").write_bytes(_las_with(NO_METRES[case]))
+    with pytest.raises(TerrainLoopError, match=r"a\.las.*reproject"):
+        read_cloud(tmp_path / "a.las")
+
+
+def test_only_las_states_a_coordinate_reference_system(tmp_path):
+    write_cloud(tmp_path / "a.ply", POINTS)
+    assert read_crs(tmp_path / "a.ply") is None
+    (tmp_path / "a.las").write_bytes(b"LASF")
+    for name in ("a.las", "absent.las"):
+        with pytest.raises(TerrainLoopError, match=name):
+            read_crs(tmp_path / name)
 
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
@@ -322,10 +545,42 @@ DAMAGED = {
     "ply: no vertices": ("ply", _ply("ascii", b"", "").replace(b"vertex", b"corner")),
     "ply: no z": ("ply", _ply("ascii", _lines(POINTS[:, :2]).encode(), _properties("double", "xy"))),
     "ply: unknown type": ("ply", _ply("ascii", _lines(POINTS).encode(), _properties("quad"))),
-    "ply: lists before the vertices": (
+    "ply: ascii, more lines": ("ply", _ply("ascii", _lines(POINTS).encode(), DOUBLES, count=399)),
+    "ply: more points": ("ply", _ply("binary_little_endian", POINTS.tobytes(), DOUBLES, count=200)),
+    "ply: faces cut short": (
         "ply",
-        _ply("binary_little_endian", FACES + POINTS.tobytes(), DOUBLES, before=FACE_HEADER),
+        _ply("binary_little_endian", POINTS.tobytes() + FACES[:4], DOUBLES, after=FACE_HEADER),
     ),
+    "ply: x twice": ("ply", _ply("binary_little_endian", POINTS.tobytes() * 2, DOUBLES + DOUBLES)),
+    "ply: ascii, x twice": ("ply", _ply("ascii", _lines(POINTS, POINTS).encode(), DOUBLES + DOUBLES)),
+    "ply: X and x": (
+        "ply",
+        _ply("ascii", _lines(POINTS, POINTS).encode(), DOUBLES + _properties("double", "XYZ")),
+    ),
+    "ply: vertices twice": (
+        "ply",
+        _ply("ascii", _lines(POINTS, POINTS).encode(), DOUBLES, before="element vertex 400\n" + DOUBLES),
+    ),
+    "ply: two points in a line": ("ply", _ply("ascii", _lines(POINTS[::2], POINTS[1::2]).encode(), DOUBLES)),
+    "ply: a count with underscores": ("ply", _ply("ascii", _lines(POINTS).encode(), DOUBLES, count="4_0_0")),
+    "ply: numbers with underscores": (
+        "ply",
+        _ply("ascii", _lines(POINTS).replace("431236.", "431_236.").encode(), DOUBLES),
+    ),
+    "ply: a misspelt keyword": ("ply", _ply("ascii", _lines(POINTS).encode(), DOUBLES + "propertie int i\n")),
+    "pcd: ascii, more lines": ("pcd", _pcd("ascii") + b"1 2 3\n"),
+    "pcd: ascii, fewer values": ("pcd", _pcd("ascii")[:-20] + b"\n"),
+    "pcd: more points": ("pcd", _pcd("binary") + SMALL[:1].tobytes()),
+    "pcd: WIDTH and POINTS": ("pcd", _pcd("binary").replace(b"WIDTH 400", b"WIDTH 200")),
+    "pcd: x twice": ("pcd", _pcd("binary").replace(b"FIELDS x y z", b"FIELDS x x z")),
+    "pcd: no such type": ("pcd", _pcd("binary").replace(b"TYPE F", b"TYPE C")),
+    "pcd: no such encoding": ("pcd", _pcd("binary").replace(b"DATA binary", b"DATA binary_zip")),
+    "las: more points": ("las", _las("las") + _las("las")[-34:]),
+    "npy: two arrays": ("npy", _saved(POINTS) + _saved(POINTS)),
+    "npy: a raster": ("npy", _saved(np.zeros((150, 40)))),
+    "npy: with fields": ("npy", _saved(np.zeros(400, "f8,f8,f8"))),
+    "npy: a truth table": ("npy", _saved(np.ones((400, 3), bool))),
+    "npz: a raster": ("npz", _npz(z=_saved(np.zeros((150, 140))), resolution=_saved(np.array(0.1)))),
     "pcd: no header": ("pcd", b"garbage " * 50),
     "pcd: header alone": ("pcd", _pcd("binary")[:-4800]),
     "pcd: cut short": ("pcd", _pcd("binary")[:-1]),
@@ -384,7 +639,6 @@ DAMAGED = {
     "xyz: fewer columns below": ("xyz", (_lines(POINTS) + "1 2\n").encode()),
     "xyz: decimal commas": ("xyz", _lines(ground()).replace(".", ",").encode()),
     "xyz: decimal commas, semicolons": ("xyz", _lines(ground(), separator=";").replace(".", ",").encode()),
-    "xyz: an empty cell": ("xyz", (_lines(POINTS, separator=",") + "1,,3\n").encode()),
     "xyz: an empty cell between tabs": ("xyz", (_lines(POINTS, separator="\t") + "1\t\t3\t4\n").encode()),
     "xyz: no text": ("xyz", b"\xff\xfe\x00" * 99),
     "xyz: comments alone": ("xyz", b"# nothing\n\n"),

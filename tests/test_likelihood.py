@@ -12,7 +12,7 @@ from terrainloop.gp.hyperparameters import (
     negative_log_likelihood,
 )
 from terrainloop.gp.kernel import Hyperparameters
-from terrainloop.gp.surface import Surface, surface_of
+from terrainloop.gp.training import TrainingData, detrend
 
 TRUTH = Hyperparameters(length_scale=0.25, variance=0.04, noise=0.02)
 
@@ -30,7 +30,7 @@ def draw(count, extent, truth=TRUTH, seed=0, relative_noise=None):
     smooth = np.einsum("ij,ij->i", along_y @ rng.standard_normal((200, 200)), along_x)
     share = np.ones(count) if relative_noise is None else relative_noise
     elevation = np.sqrt(truth.variance) * smooth + truth.noise * share * rng.standard_normal(count)
-    return Surface(xy, elevation, np.zeros(3), np.zeros(2), share)
+    return TrainingData(xy, elevation, np.zeros(3), np.zeros(2), share)
 
 
 def blocks_of(surface, about=TRUTH, side=2.0, work=1e12):
@@ -103,7 +103,7 @@ def test_fit_is_near_the_dense_one_where_the_terrain_is_no_draw_from_the_prior()
     distances = np.linalg.norm(xy[:, None] - rocks, axis=2)
     elevation = 0.3 * np.sin(xy[:, 0]) + 0.15 * np.exp(-((distances / 0.25) ** 2)).sum(axis=1)
     elevation += 0.03 * rng.standard_normal(1000)
-    surface = surface_of(np.c_[xy, elevation])
+    surface = detrend(np.c_[xy, elevation])
     start = surface.start(None, None, None)
     dense = maximise_likelihood([surface], start, workers=2)
     fitted = fit_blocks([surface], start, workers=2)
@@ -163,7 +163,7 @@ def test_few_points_and_one_block_are_fitted():
 def test_a_stray_point_does_no_harm():
     surface = draw(3000, 3.0)
     xy, elevation = np.r_[surface.xy, [[1e6, 2e6]]], np.r_[surface.elevation, 0.0]
-    stray = Surface(xy, elevation, np.zeros(3), np.zeros(2), np.ones(3001))
+    stray = TrainingData(xy, elevation, np.zeros(3), np.zeros(2), np.ones(3001))
     fitted = fit_blocks([stray], surface.start(None, None, None), workers=2)
     assert fitted.length_scale == pytest.approx(TRUTH.length_scale, rel=0.1)
 
@@ -171,8 +171,8 @@ def test_a_stray_point_does_no_harm():
 def test_numbers_that_make_no_model_are_refused(surface):
     with pytest.raises(ValueError, match="positive"):
         blocks_of(surface, side=-1.0)
-    with pytest.raises(ValueError, match="noise positive"):
-        blocks_of(Surface(surface.xy, surface.elevation, np.zeros(3), np.zeros(2), np.zeros(400)))
+    with pytest.raises(ValueError, match="noise must be positive"):
+        blocks_of(TrainingData(surface.xy, surface.elevation, np.zeros(3), np.zeros(2), np.zeros(400)))
 
 
 def test_where_drawn_points_show_only_noise_more_are_drawn():

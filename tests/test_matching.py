@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import BY_INLIERS, STRICT, with_match
+from conftest import BY_INLIERS, STRICT, with_match, with_pixels
 from scipy.ndimage import map_coordinates
 
 from terrainloop.config import Calibration
@@ -97,10 +97,8 @@ def test_a_keypoint_of_two_orientations_is_one_spot():
     """Spots 3 and 5 stand twice on both sides, with a descriptor for each orientation."""
     source, target = features(20, seed=1), features(20, seed=2)
     target = replace(target, descriptors=source.descriptors + np.float32(0.01))
-    again = {3: 18, 5: 19}
-    for features_of_map in (source, target):
-        for spot, copy in again.items():
-            features_of_map.positions[copy] = features_of_map.positions[spot]
+    places = [*range(18), 3, 5]
+    source, target = (replace(each, positions=each.positions[places]) for each in (source, target))
     found = associate(source, target)
     assert nearest(source, target) == {(i, i) for i in range(20)}
     assert len(found) == 18
@@ -224,8 +222,8 @@ def test_overlap_of_a_quarter_turn(world):
 
 def test_overlap_counts_known_ground_only(world):
     source, target = square_map(world), square_map(world)
-    source.mask[:, 30:] = False
-    target.mask[:20] = False
+    source = with_pixels(source, np.s_[:, 30:], mask=False)
+    target = with_pixels(target, np.s_[:20], mask=False)
     ssd = compute_ssd(source, target, np.eye(3))
     assert ssd.overlap == pytest.approx(20 * 30 / (40 * 30 + 20 * 60 - 20 * 30), rel=0.05)
 

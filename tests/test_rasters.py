@@ -1,9 +1,13 @@
 """GeoTIFF files as other programs read them."""
 
+from xml.etree import ElementTree as ET
+from xml.sax.saxutils import unescape
+
 import numpy as np
 import pytest
 import tifffile
 
+from terrainloop.errors import TerrainLoopError
 from terrainloop.io.rasters import write_geotiff
 
 ORIGIN, RESOLUTION = (431234.5, 3761234.25), 0.25
@@ -74,6 +78,88 @@ def test_one_band(tmp_path, bands):
 def test_file_is_the_same_each_time(file, bands, tmp_path):
     write_geotiff(tmp_path / "again.tif", bands, ORIGIN, RESOLUTION)
     assert file.read_bytes() == (tmp_path / "again.tif").read_bytes()
+
+
+def _tags(path):
+    with tifffile.TiffFile(path) as tiff:
+        return {tag.code: tag.value for tag in tiff.pages[0].tags}
+
+
+def test_no_value_where_ground_is_not_known(tmp_path, bands):
+    mask = np.arange(35).reshape(SHAPE) % 3 > 0
+    kept = {name: band.copy() for name, band in bands.items()}
+    write_geotiff(tmp_path / "a.tif", bands, ORIGIN, RESOLUTION, mask=mask)
+    for read, written in zip(tifffile.imread(tmp_path / "a.tif"), kept.values(), strict=True):
+        np.testing.assert_array_equal(np.isnan(read), ~mask[::-1])
+        np.testing.assert_array_equal(read[mask[::-1]], written[::-1][mask[::-1]])
+    assert _tags(tmp_path / "a.tif")[42113] == "nan"
+    assert all(np.array_equal(bands[name], kept[name]) for name in bands)
+
+
+@pytest.mark.parametrize("names", [("elevation", "slope"), ("a & b <c>", 'h\u00f6he "m"')])
+def test_gdal_has_the_names_of_bands(tmp_path, names):
+    write_geotiff(tmp_path / "a.tif", dict.fromkeys(names, np.zeros(SHAPE)), ORIGIN, RESOLUTION)
+    items = ET.fromstring(_tags(tmp_path / "a.tif")[42112])
+    assert items.tag == "GDALMetadata"
+    assert [(item.get("name"), item.get("role"), item.get("sample")) for item in items] == [
+        ("DESCRIPTION", "description", "0"),
+        ("DESCRIPTION", "description", "1"),
+    ]
+    assert tuple(unescape(item.text) for item in items) == names  # GDAL escapes twice
+
+
+def test_projected_system_by_its_code(tmp_path, bands):
+    write_geotiff(tmp_path / "a.tif", bands, ORIGIN, RESOLUTION, crs=32611)
+    keys = np.reshape(_tags(tmp_path / "a.tif")[34735], (-1, 4)).tolist()
+    assert keys == [[1, 1, 0, 3], [1024, 0, 1, 1], [1025, 0, 1, 2], [3072, 0, 1, 32611]]
+
+
+def test_projected_system_as_text(tmp_path, bands):
+    wkt = 'PROJCS["caf\u00e9|","b"]'
+    write_geotiff(tmp_path / "a.tif", bands, ORIGIN, RESOLUTION, crs=wkt)
+    tags = _tags(tmp_path / "a.tif")
+    version, raster_type, citation = np.reshape(tags[34735], (-1, 4)).tolist()
+    assert (version, raster_type) == ([1, 1, 0, 2], [1025, 0, 1, 2])
+    assert tags[34737] == 'PROJCS["caf&#233; ","b"]|'
+    assert citation == [1026, 34737, len(tags[34737]), 0]
+
+
+@pytest.mark.parametrize("crs", [0, -1, 32767, 70000])
+def test_codes_that_name_no_projected_system(tmp_path, bands, crs):
+    with pytest.raises(TerrainLoopError, match=f"EPSG.*{crs}"):
+        write_geotiff(tmp_path / "a.tif", bands, ORIGIN, RESOLUTION, crs=crs)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("shapes", "mask"),
+    [([], None), ([(3, 4), (4, 3)], None), ([(3, 4)], (4, 3)), ([(12,)], None), ([(0, 4)], None)],
+)
+def test_bands_that_do_not_fit(tmp_path, shapes, mask):
+    bands = {str(i): np.zeros(shape) for i, shape in enumerate(shapes)}
+    with pytest.raises(TerrainLoopError, match="shape"):
+        write_geotiff(
+            tmp_path / "a.tif", bands, ORIGIN, 0.1, mask=None if mask is None else np.ones(mask, bool)
+        )
+
+
+@pytest.mark.parametrize(("origin", "resolution"), [((0, 0), 0), ((0, 0), np.nan), ((np.inf, 0), 1)])
+def test_places_that_are_none(tmp_path, bands, origin, resolution):
+    with pytest.raises(TerrainLoopError, match="finite origin"):
+        write_geotiff(tmp_path / "a.tif", bands, origin, resolution)
+
+
+def test_rasterio_agrees_on_what_is_beside_the_bands(tmp_path, bands):
+    rasterio = pytest.importorskip("rasterio")
+    mask = np.ones(SHAPE, bool)
+    mask[0, 0] = False
+    bands = {"a & b <c>": bands["x"], 'h\u00f6he "m"': bands["y"]}
+    write_geotiff(tmp_path / "a.tif", bands, ORIGIN, RESOLUTION, mask=mask, crs=32611)
+    with rasterio.open(tmp_path / "a.tif") as raster:
+        assert raster.crs.to_epsg() == 32611
+        assert raster.descriptions == tuple(bands)
+        assert np.isnan(raster.nodata)
+        np.testing.assert_array_equal(raster.read(1, masked=True).mask, ~mask[::-1])
 
 
 def test_rasterio_agrees(file, bands):

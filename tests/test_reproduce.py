@@ -2,18 +2,27 @@
 
 import csv
 import json
+import shutil
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
-ROOT = Path(__file__).parent.parent
+from reproduce import figures, kept, missions, runner, table, visual
+from reproduce.__main__ import arguments
+from reproduce.missions import FRAMES_FILE, Drive, StandIn, pairs_of, simulated
+from reproduce.results import Result, best_of_each
+from reproduce.runner import read_pairs, run_all, tasks_of
+from reproduce.visual import Frames
+from terrainloop.errors import TerrainLoopError
+from terrainloop.io.files import write_whole_text
+from terrainloop.io.trajectories import Trajectory, read_trajectory, write_tum
 
 METHODS = """
 import numpy as np
-from terrainloop.evaluation.baselines.method import Match, Method, require
+from reproduce.baselines.method import Match, Method, require
 
 def made(name, describe, score, **settings):
     return Method(name, settings, "made up 1.0", describe, score)
@@ -51,22 +60,18 @@ def methods(scale):
 
 @pytest.fixture(scope="module", autouse=True)
 def modules(tmp_path_factory):
-    """`reproduce`, which is not installed, and the methods of this test can be imported."""
+    """The methods of this test can be imported."""
     folder = tmp_path_factory.mktemp("methods")
     for name, code in (("good", GOOD), ("crashing", CRASHING), ("absent", ABSENT)):
         (folder / f"made_{name}.py").write_text(code)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(folder))
-        patch.syspath_prepend(str(ROOT))
         yield
 
 
 @pytest.fixture(scope="module")
 def drive(mission_folder, tmp_path_factory):
     """The mission of five clouds without the broken one."""
-    from reproduce.missions import Drive
-    from terrainloop.io.trajectories import Trajectory, read_trajectory, write_tum
-
     folder = tmp_path_factory.mktemp("drive")
     (folder / "clouds").mkdir()
     whole = [0, 1, 3, 4]
@@ -81,16 +86,12 @@ def drive(mission_folder, tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(drive, tmp_path_factory):
     """Tasks of all made-up methods, run once, and what was told."""
-    from reproduce.runner import run_all, tasks_of
-
     out = tmp_path_factory.mktemp("out")
     tasks = tasks_of(drive, ["made_good", "made_crashing"], out, first_only=False)
     return tasks, run_all(tasks, workers=2), out
 
 
 def results_of(tasks):
-    from reproduce.results import Result
-
     return [Result.of(task) for task in tasks]
 
 
@@ -100,8 +101,6 @@ def rows_of(path):
 
 
 def test_every_pair_but_neighbours_is_scored(run, drive):
-    from reproduce.runner import read_pairs
-
     _, done, _ = run
     pairs = read_pairs(done[0].csv)
     assert [(pair.source, pair.target) for pair in pairs] == [
@@ -115,8 +114,6 @@ def test_every_pair_but_neighbours_is_scored(run, drive):
 
 
 def test_pairs_of_one_session_are_left_out():
-    from reproduce.missions import pairs_of
-
     assert pairs_of("abcd", None) == [(2, 0), (3, 0), (3, 1)]
     assert pairs_of("abcd", {"a": "x", "b": "y", "c": "x", "d": "y"}) == [(3, 0)]
 
@@ -139,16 +136,12 @@ def test_a_crash_stops_no_other(run):
 
 
 def test_a_crash_is_told_in_a_line(run, capsys):
-    from reproduce.runner import run_all
-
     assert run_all([run[0][3]], workers=1) == []
     told = capsys.readouterr().out.splitlines()
     assert told[-1].startswith("[1/1] tiny made_crashing-0: failed (exit 11)")
 
 
 def test_what_is_done_is_not_done_again(run, capsys):
-    from reproduce.runner import run_all
-
     before = [task.csv.stat().st_mtime_ns for task in run[1]]
     assert run_all(run[1], workers=1) == run[1]
     assert [task.csv.stat().st_mtime_ns for task in run[1]] == before
@@ -162,9 +155,41 @@ def test_other_settings_or_software_are_run_again(run):
     assert not replace(task, method=replace(task.method, software="made up 1.1")).done
 
 
-def test_missing_package_is_told_in_a_line_and_left_out(drive, tmp_path, capsys):
-    from reproduce.runner import tasks_of
+def test_results_of_other_code_or_another_machine_are_run_again(run, monkeypatch):
+    for name in ("code_key", "processor"):
+        with monkeypatch.context() as patch:
+            patch.setattr(runner, name, lambda: "another")
+            assert not replace(run[1][0]).done
+    assert replace(run[1][0]).done
 
+
+def test_results_of_another_mission_are_run_again(run, drive, tmp_path):
+    """What is in the clouds counts; where they are and their dates do not."""
+    copy = shutil.copytree(drive.path, tmp_path / "copy")
+    assert replace(run[1][0], drive=Drive("tiny", copy, 0.3)).done
+    (copy / "clouds" / "000003.ply").write_bytes((copy / "clouds" / "000004.ply").read_bytes())
+    assert not replace(run[1][0], drive=Drive("tiny", copy, 0.3)).done
+
+
+@pytest.mark.parametrize("record", ["", "{}", "[]", '{"key": null}', '{"software": "made up 1.0"}'])
+def test_a_record_without_a_key_is_of_no_use(run, tmp_path, record):
+    task = replace(run[1][0], folder=tmp_path)
+    task.csv.write_text("source,target\n")
+    task.json.write_text(record)
+    assert not task.done
+
+
+def test_code_is_that_of_both_packages_and_what_they_run_on(monkeypatch, tmp_path):
+    (tmp_path / "kept.py").write_text("")
+    keys = {kept.code_key.__wrapped__()}
+    for name, value in (("__file__", str(tmp_path / "kept.py")), ("package", lambda: ()), ("versions", dict)):
+        with monkeypatch.context() as patch:
+            patch.setattr(kept, name, value)
+            keys.add(kept.code_key.__wrapped__())
+    assert len(keys) == 4
+
+
+def test_missing_package_is_told_in_a_line_and_left_out(drive, tmp_path, capsys):
     tasks = tasks_of(drive, ["made_absent", "made_good"], tmp_path, first_only=True)
     assert [(task.method.name, task.variant) for task in tasks] == [("good", 0), ("other", 2)]
     told = capsys.readouterr().out.splitlines()
@@ -173,8 +198,6 @@ def test_missing_package_is_told_in_a_line_and_left_out(drive, tmp_path, capsys)
 
 
 def test_half_a_file_is_never_left(tmp_path):
-    from reproduce.runner import write_whole
-
     path = tmp_path / "a.csv"
     path.write_text("old")
 
@@ -183,7 +206,7 @@ def test_half_a_file_is_never_left(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_whole(path, fail)
+        write_whole_text(path, fail)
     assert path.read_text() == "old"
 
 
@@ -203,8 +226,6 @@ def changed(result, change):
 
 
 def test_best_settings_are_chosen_by_the_reading(run):
-    from reproduce.results import best_of_each
-
     first, second, other = results_of(run[1])
     backwards = changed(first, lambda candidate: replace(candidate, score=-candidate.score))
     astray = replace(second, pairs=[replace(pair, position_error=5.0) for pair in second.pairs])
@@ -214,16 +235,12 @@ def test_best_settings_are_chosen_by_the_reading(run):
 
 
 def test_a_method_that_could_compare_nothing_is_left_out(run):
-    from reproduce.results import best_of_each
-
     first, *_, other = results_of(run[1])
     silent = changed(first, lambda candidate: replace(candidate, score=-np.inf))
     assert best_of_each([silent, other], "overlap") == [other]
 
 
 def test_figures_have_their_numbers_beside_them(run, drive, tmp_path):
-    from reproduce import figures
-
     results = results_of(run[1])
     looks = figures.looks_of(["good", "other"])
     chosen = {"tiny": [results[0], results[2]]}
@@ -246,8 +263,6 @@ def test_figures_have_their_numbers_beside_them(run, drive, tmp_path):
 
 
 def test_tables(run, tmp_path):
-    from reproduce import table
-
     by_mission = {"tiny": results_of(run[1])}
     rows = table.main_table(by_mission)
     assert [(row["mission"], row["method"]) for row in rows] == [("tiny", "good"), ("tiny", "other")]
@@ -264,8 +279,6 @@ def test_tables(run, tmp_path):
 
 
 def test_visual_loops_are_judged_by_place():
-    from reproduce.visual import Frames
-
     near = np.zeros((4, 4), dtype=bool)
     near[2, 0] = near[3, 1] = True
     frames = Frames("tiny", np.array([-1, 0, 0, 0]), np.array([0, 9, 30, 20]), near, near)
@@ -275,33 +288,70 @@ def test_visual_loops_are_judged_by_place():
     assert is_right.tolist() == [False, False, True, False]
 
 
-def test_visual_figure_tells_its_control(tmp_path):
-    from reproduce.figures import visual_curves
-    from reproduce.visual import Frames
+def test_visual_loops_are_found_again_by_other_code(drive, tmp_path, monkeypatch):
+    found = []
 
+    def write(drive, file, skipped):
+        found.append(skipped)
+        file.write_text("image,closed,inliers\n0,-1,0\n")
+
+    monkeypatch.setattr(visual, "_write", write)
+    folder = shutil.copytree(drive.path, tmp_path / "drive")
+    np.save(folder / FRAMES_FILE, np.eye(4)[None, None])
+    for skipped in (14, 14, 0, 0):
+        Frames.of(Drive("tiny", folder, 0.3), tmp_path / "frames.csv", skipped)
+    assert found == [14, 0]
+    monkeypatch.setattr(visual, "code_key", lambda: "of other code")
+    Frames.of(Drive("tiny", folder, 0.3), tmp_path / "frames.csv", 0)
+    assert found == [14, 0, 0]
+
+
+def test_visual_figure_tells_its_control(tmp_path):
     near = np.eye(4, k=-1, dtype=bool)
     control = Frames("tiny", np.array([-1, 0, 1, 0]), np.array([0, 9, 30, 20]), near, near)
-    visual_curves([control], [control]).save(tmp_path, "fig7")
+    figures.visual_curves([control], [control]).save(tmp_path, "fig7")
     assert (tmp_path / "fig7.png").exists()
     rows = [row for row in rows_of(tmp_path / "fig7.csv") if row["true"].startswith("control")]
     assert [row["precision"][:4] for row in rows] == ["1.0", "0.5", "0.66"]
 
 
-def test_simulated_mission_is_kept_and_another_refused(tmp_path):
-    from reproduce.missions import StandIn, simulated
-    from terrainloop.errors import TerrainLoopError
+@pytest.fixture
+def simulations(monkeypatch):
+    """Missions that are simulated, in name only."""
+    made = []
+    monkeypatch.setattr(missions, "simulate_mission", lambda **asked: made.append(asked) or asked)
+    monkeypatch.setattr(
+        missions,
+        "write_mission",
+        lambda asked, folder: (folder / "simulation.yaml").write_text(yaml.safe_dump(asked)),
+    )
+    monkeypatch.setattr(missions, "_write_appearance", lambda asked, folder: None)
+    return made
 
-    stand_in = StandIn("Flat", "flat", 1, "stereo", 0.3)
-    (tmp_path / "Flat").mkdir()
-    (tmp_path / "Flat" / "simulation.yaml").write_text("{world: flat, seed: 1, submaps: 2, sensor: stereo}")
-    assert simulated(stand_in, tmp_path, 2).path == tmp_path / "Flat"
+
+FLAT = StandIn("Flat", "flat", 1, "stereo", 0.3)
+
+
+def test_simulated_mission_is_kept_and_another_refused(simulations, tmp_path):
+    for _ in range(2):
+        assert simulated(FLAT, tmp_path, 2).path == tmp_path / "Flat"
+    assert len(simulations) == 1
     with pytest.raises(TerrainLoopError, match="another output folder"):
-        simulated(stand_in, tmp_path, 3)
+        simulated(FLAT, tmp_path, 3)
+
+
+def test_other_code_simulates_a_mission_anew(simulations, tmp_path, monkeypatch):
+    left_over = simulated(FLAT, tmp_path, 2).path / "clouds.ply"
+    left_over.touch()
+    monkeypatch.setattr(missions, "code_key", lambda: "of other code")
+    simulated(FLAT, tmp_path, 2)
+    assert len(simulations) == 2
+    assert not left_over.exists()
+    simulated(FLAT, tmp_path, 2)
+    assert len(simulations) == 2
 
 
 def test_of_a_large_real_mission_the_middle_is_taken(drive, tmp_path, monkeypatch):
-    from reproduce import missions
-
     whole = missions.real(drive.path, tmp_path)
     assert whole.path == drive.path
     monkeypatch.setattr(missions, "REAL_SUBMAPS", 2)
@@ -312,8 +362,6 @@ def test_of_a_large_real_mission_the_middle_is_taken(drive, tmp_path, monkeypatc
 
 
 def test_unknown_figure_is_refused(monkeypatch, capsys):
-    from reproduce.__main__ import arguments
-
     monkeypatch.setattr(sys, "argv", ["reproduce", "--only", "fig8,fig5"])
     with pytest.raises(SystemExit, match="2"):
         arguments()

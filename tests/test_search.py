@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from conftest import with_pixels
 from scipy.ndimage import map_coordinates
 
 from terrainloop import _core
@@ -112,7 +113,7 @@ def test_search_is_the_naive_loop(world, ground):
     T = ABOUT @ se2(0.2, -0.1, 2.0) @ inverse(ABOUT)
     source, target = world(3 if ground == "other" else 0).map(T, shape=(30, 30)), world(0).map(shape=(34, 28))
     if ground == "half flat":
-        target.gradient_x[:, :14] = target.gradient_y[:, :14] = 0.0
+        target = with_pixels(target, np.s_[:, :14], gradient_x=0.0, gradient_y=0.0)
     source, target = entry(source), entry(target)
     found = search(source, target, 4)
     null, tried, best = naive(source, target, len(found.null_area))

@@ -1,5 +1,6 @@
 import functools
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import yaml
 from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import inverse, transform, yaw_of
 from terrainloop.io.clouds import read_cloud
+from terrainloop.io.missions import load_mission
 from terrainloop.io.trajectories import read_trajectory
 from terrainloop.simulation.missions import SETUPS, simulate_mission, thin, write_mission
 from terrainloop.simulation.odometry import Drift, estimate, true_poses
@@ -197,3 +199,55 @@ def test_thinning_averages_each_voxel():
 def test_bad_arguments_are_named(arguments):
     with pytest.raises(TerrainLoopError, match="expected"):
         simulate_mission(**{"submaps": 1, **arguments})
+
+
+def _shortened(mission, count):
+    changes = {
+        name: getattr(mission, name)[:count] for name in ("clouds", "odometry", "truth", "legs", "frames")
+    }
+    return replace(mission, **changes)
+
+
+def test_a_shorter_mission_replaces_a_longer_one_and_leaves_the_rest(mission, tmp_path):
+    write_mission(mission, tmp_path)
+    for name in ("notes.txt", "map.npz", "clouds/readme.md"):
+        (tmp_path / name).write_text("the user's")
+    write_mission(_shortened(mission, 1), tmp_path)
+    assert len(load_mission(tmp_path)) == 1
+    files = sorted(file.relative_to(tmp_path).as_posix() for file in tmp_path.rglob("*") if file.is_file())
+    ours = ["clouds/000000.ply", "odometry.tum", "simulation.yaml", "truth.tum"]
+    assert files == sorted([*ours, "notes.txt", "map.npz", "clouds/readme.md"])
+    write_mission(mission, tmp_path)
+    assert len(load_mission(tmp_path)) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "described"),
+    [
+        ("clouds/scan.pcd", False),
+        ("clouds/000000.ply", False),
+        ("scan.LAZ", False),
+        ("odometry.tum", False),
+        ("clouds/000002.ply", True),
+        ("clouds/0.ply", True),
+        ("clouds/notes.csv", True),
+    ],
+)
+def test_what_simulate_did_not_write_is_neither_deleted_nor_joined(mission, tmp_path, name, described):
+    if described:
+        write_mission(mission, tmp_path)
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("the user's")
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    with pytest.raises(TerrainLoopError, match=f"{name}, which.*did not write.*another folder"):
+        write_mission(_shortened(mission, 1), tmp_path)
+    assert before == {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+
+
+@pytest.mark.parametrize("content", ["submaps: 99", "[1, 2]", "words", "{", "submaps: 1" + "0" * 300, ""])
+def test_a_description_of_something_else_makes_nothing_ours(mission, tmp_path, content):
+    write_mission(mission, tmp_path)
+    (tmp_path / "simulation.yaml").write_text(content)
+    with pytest.raises(TerrainLoopError, match="did not write"):
+        write_mission(mission, tmp_path)
+    assert len(load_mission(tmp_path)) == 2

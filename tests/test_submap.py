@@ -1,6 +1,7 @@
 import logging
 import pickle
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,6 +59,13 @@ BROKEN = {
     "columns": (np.zeros((500, 2)), "shape (500, 2)"),
     "transposed": (ground().T, "transpose"),
     "flat array": (ground().ravel(), "(1200,)"),
+    "path": (Path("cloud.ply"), "read_cloud"),
+    "name of a file": ("cloud.ply", "read_cloud"),
+    "nothing": (None, "object"),
+    "set": ({1.0, 2.0}, "object"),
+    "booleans": (np.ones((500, 3), bool), "bool"),
+    "dates": (np.zeros((500, 3), "datetime64[s]"), "datetime64"),
+    "records": (np.zeros(500, "f8,f8,f8"), "(500,)"),
     "words": ([["a", "b", "c"]] * 500, "<U1"),
     "ragged": ([[0.0, 1.0, 2.0], [1.0]], "object"),
     "complex": (ground() + 0j, "complex128"),
@@ -139,3 +147,35 @@ def test_repairs_outlive_replace_and_pickle():
     assert len(submap.repairs) == 2
     assert later.repairs == copy.repairs == submap.repairs
     assert np.array_equal(copy.points, submap.points)
+
+
+def test_arrays_are_read_only_and_the_callers_stay_as_they_are():
+    points, intensity = ground(), np.arange(400.0)
+    submap = Submap(points, intensity=intensity)
+    for each in (submap, pickle.loads(pickle.dumps(submap)), replace(submap, name="b")):
+        for array in (each.points, each.intensity):
+            with pytest.raises(ValueError, match="read-only"):
+                array[0] = 0.0
+    points[0] = intensity[0] = 7.0
+
+
+def test_masked_points_are_not_taken():
+    points = np.ma.masked_array(ground().astype(np.float32), np.arange(1200).reshape(400, 3) < 30)
+    assert np.array_equal(Submap(points).points, ground().astype(np.float32)[10:])
+
+
+@pytest.mark.parametrize("change", [{"name": None}, {"name": 7}, {"session": 3}, {"session": None}])
+def test_labels_are_text(change):
+    with pytest.raises(TerrainLoopError, match="rename"):
+        Submap(ground(), **change)
+
+
+@pytest.mark.parametrize("stamp", [np.nan, np.inf, "12", None, [1.0], 1j])
+def test_a_stamp_is_a_finite_number(stamp):
+    with pytest.raises(TerrainLoopError, match="stamp"):
+        Submap(ground(), stamp=stamp)
+
+
+def test_a_submap_describes_itself_in_a_line():
+    assert repr(Submap(ground() * [1, 0.5, 1], name="a7")).startswith("Submap('a7', 400 points, 9.9")
+    assert len(repr(Submap(ground()))) < 80

@@ -3,7 +3,9 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 
+#include <algorithm>
 #include <cstdint>
+#include <limits>
 #include <memory>
 #include <string>
 #include <utility>
@@ -20,6 +22,8 @@ using Doubles = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using AnyArray = nb::ndarray<nb::ro, nb::device::cpu>;
 
+constexpr std::size_t kLargestInt = std::numeric_limits<int>::max();
+
 template <typename T>
 ImageView<T> view(const AnyArray& array, const char* name, const char* dtype) {
   const std::string subject(name);
@@ -27,6 +31,7 @@ ImageView<T> view(const AnyArray& array, const char* name, const char* dtype) {
   if (array.dtype() != nb::dtype<T>()) throw nb::value_error((subject + " must be " + dtype).c_str());
   if (array.size() == 0) throw nb::value_error((subject + " must not be empty").c_str());
   const std::size_t rows = array.shape(0), cols = array.shape(1);
+  if (std::max(rows, cols) > kLargestInt) throw nb::value_error((subject + " is too large").c_str());
   const bool packed = (cols == 1 || array.stride(1) == 1) &&
                       (rows == 1 || array.stride(0) == static_cast<std::int64_t>(cols));
   if (!packed)

@@ -48,7 +48,7 @@ constexpr std::uint64_t bits(Bits... bit) {
 
 bool all(std::uint64_t flags, std::uint64_t wanted) { return (flags & wanted) == wanted; }
 
-/// Level of x86-64 that this CPU has, by the table of the x86-64 psABI, section 3.1.1.
+/// Level of x86-64 that this CPU has, at most 3, by the table of the x86-64 psABI, section 3.1.1.
 int level() {
   const Registers basic = cpuid(1), structured = cpuid(7), extended = cpuid(0x80000001);
   // SSE3, SSSE3, CMPXCHG16B, SSE4.1, SSE4.2, POPCNT; LAHF
@@ -57,9 +57,7 @@ int level() {
   if (!all(basic.c, bits(12, 22, 27, 28, 29)) || !all(structured.b, bits(3, 5, 8)) ||
       !all(extended.c, bits(5)) || !all(saved_state(), bits(1, 2)))
     return 2;
-  // AVX512F, DQ, CD, BW, VL; mask registers and both parts of the AVX-512 registers
-  if (!all(structured.b, bits(16, 17, 28, 30, 31)) || !all(saved_state(), bits(5, 6, 7))) return 3;
-  return 4;
+  return 3;
 }
 
 }  // namespace

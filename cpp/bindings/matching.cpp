@@ -6,17 +6,19 @@
 #include <tuple>
 
 #include "arrays.hpp"
+#include "matching/search.hpp"
 #include "terrainloop/field.hpp"
 #include "terrainloop/inliers.hpp"
 #include "terrainloop/refine.hpp"
-#include "terrainloop/search.hpp"
 
 namespace terrainloop {
 namespace {
 
 auto search_spectra(const Floats& images, int size) {
-  if (images.ndim() != 4 || images.shape(0) % search::kLanes != 0 || images.shape(1) != 2 ||
-      images.shape(2) != images.shape(3) || images.shape(2) > static_cast<std::size_t>(size))
+  if (size < 1) throw nb::value_error("size must be positive");
+  if (images.ndim() != 4 || images.shape(0) > kLargestInt || images.shape(0) % search::kLanes != 0 ||
+      images.shape(1) != 2 || images.shape(2) != images.shape(3) ||
+      images.shape(2) > static_cast<std::size_t>(size))
     throw nb::value_error("images must be (K, 2, n, n), K a multiple of LANES, n no more than size");
   const std::size_t blocks = images.shape(0) / search::kLanes, side = size;
   std::vector<float> spectra;
@@ -33,7 +35,8 @@ nb::tuple search_correlate(const Floats& fields, const Floats& ground, const Flo
   const auto has_shape = [](const Floats& array, const std::vector<std::size_t>& shape) {
     return array.ndim() == shape.size() && std::equal(shape.begin(), shape.end(), array.shape_ptr());
   };
-  if (fields.ndim() != 6) throw nb::value_error("fields must be (blocks, 2, size, waves, 2, LANES)");
+  if (fields.ndim() != 6 || std::max(fields.shape(0), fields.shape(2)) > kLargestInt)
+    throw nb::value_error("fields must be (blocks, 2, size, waves, 2, LANES)");
   const std::size_t blocks = fields.shape(0), size = fields.shape(2), half = size / 2;
   const std::size_t lanes = search::kLanes;
   if (!has_shape(fields, {blocks, 2, size, size / 2 + 1, 2, lanes}) ||
@@ -59,7 +62,8 @@ nb::tuple search_correlate(const Floats& fields, const Floats& ground, const Flo
 }
 
 Lookup affine(const Doubles& matrix) {
-  if (matrix.ndim() != 2 || matrix.size() != 9) throw nb::value_error("affine must be (3, 3)");
+  if (matrix.ndim() != 2 || matrix.shape(0) != 3 || matrix.shape(1) != 3)
+    throw nb::value_error("affine must be (3, 3)");
   Lookup rows;
   std::copy(matrix.data(), matrix.data() + 6, rows.begin());
   return rows;
@@ -69,9 +73,6 @@ auto turn(const AnyArray& x, const AnyArray& y, const AnyArray& known, const Dou
           int cols) {
   const ImageView<float> images[] = {view<float>(x, "x", "float32"), view<float>(y, "y", "float32"),
                                      view<float>(known, "known", "float32")};
-  for (const ImageView<float>& image : images)
-    if (image.rows != images[0].rows || image.cols != images[0].cols)
-      throw nb::value_error("x, y and known must be of one shape");
   if (rows < 0 || cols < 0) throw nb::value_error("rows and cols must not be negative");
   const Lookup to = affine(lookup);
   const std::size_t height = rows, width = cols;
@@ -104,9 +105,6 @@ refine::Gradients gradients(const GradientArrays& map) {
                                std::get<0>(origin),
                                std::get<1>(origin),
                                resolution};
-  for (const ImageView<float>& image : {seen.x, seen.y, seen.variance})
-    if (image.rows != seen.mask.rows || image.cols != seen.mask.cols)
-      throw nb::value_error("gradients, variance and mask must be of one shape");
   return seen;
 }
 
@@ -114,8 +112,6 @@ nb::object settle(const GradientArrays& source, const GradientArrays& target, co
                   int places, int steps, double tolerance) {
   const refine::Gradients from = gradients(source), to = gradients(target);
   const Lookup rows = affine(motion);
-  if (step < 1 || places < 1 || steps < 0)
-    throw nb::value_error("step and places must be at least 1, steps 0");
   std::optional<refine::Linearised> found;
   {
     nb::gil_scoped_release release;

@@ -2,8 +2,6 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
-#include <algorithm>
-#include <cmath>
 #include <memory>
 #include <optional>
 #include <tuple>
@@ -11,6 +9,7 @@
 #include <vector>
 
 #include "arrays.hpp"
+#include "level.hpp"
 #include "terrainloop/gp.hpp"
 #include "terrainloop/likelihood.hpp"
 #include "terrainloop/surf.hpp"
@@ -18,25 +17,11 @@
 namespace terrainloop {
 namespace {
 
-ImageView<float> image_view(const AnyArray& array) {
-  const ImageView<float> image = view<float>(array, "image", "float32");
-  if (!std::all_of(image.data, image.data + array.size(), [](float v) { return std::isfinite(v); }))
-    throw nb::value_error("image must be finite");
-  return image;
-}
-
 nb::tuple surf_extract(const AnyArray& image, std::optional<AnyArray> mask, double threshold, int octaves,
                        int intervals, std::optional<std::size_t> max_keypoints) {
-  const ImageView<float> pixels = image_view(image);
+  const auto pixels = view<float>(image, "image", "float32");
   ImageView<std::uint8_t> allowed;
-  if (mask) {
-    allowed = view<std::uint8_t>(*mask, "mask", "uint8");
-    if (allowed.rows != pixels.rows || allowed.cols != pixels.cols)
-      throw nb::value_error("mask must have the shape of image");
-  }
-  if (!(threshold >= 0.0)) throw nb::value_error("threshold must be >= 0");
-  if (octaves < 1 || octaves > 16) throw nb::value_error("octaves must be within 1..16");
-  if (intervals < 3 || intervals > 16) throw nb::value_error("intervals must be within 3..16");
+  if (mask) allowed = view<std::uint8_t>(*mask, "mask", "uint8");
   surf::Settings settings{threshold, octaves, intervals};
   if (max_keypoints) settings.max_keypoints = *max_keypoints;
 
@@ -56,8 +41,7 @@ nb::tuple surf_extract(const AnyArray& image, std::optional<AnyArray> mask, doub
 }
 
 auto fast_hessian(const AnyArray& image, int filter_size) {
-  const ImageView<float> pixels = image_view(image);
-  if (filter_size < 9 || filter_size % 6 != 3) throw nb::value_error("filter_size must be 9, 15, 21, ...");
+  const auto pixels = view<float>(image, "image", "float32");
   std::vector<double> response;
   {
     nb::gil_scoped_release release;
@@ -115,12 +99,13 @@ nb::list gp_predict_at(const Doubles& xy, const Doubles& elevation, const Double
   });
 }
 
-auto gp_noise_ratio(const Doubles& xy, const Doubles& elevation, double cell, int threads) {
+auto gp_noise_ratio(const Doubles& xy, const Doubles& elevation, double cell, double smallest_scatter,
+                    int threads) {
   const gp::Points points = points_view(xy, elevation, elevation);
   std::vector<double> ratio(points.count);
   {
     nb::gil_scoped_release release;
-    gp::noise_ratio(points.xy, points.elevation, points.count, cell, ratio.data(), threads);
+    gp::noise_ratio(points.xy, points.elevation, points.count, cell, smallest_scatter, ratio.data(), threads);
   }
   return to_numpy(std::move(ratio), {points.count, 1});
 }
@@ -151,15 +136,7 @@ nb::tuple gp_block_likelihood(const std::vector<std::tuple<Doubles, Doubles, Dou
 
 NB_MODULE(TERRAINLOOP_MODULE, module) {
   module.attr("VARIANT") = TERRAINLOOP_VARIANT;
-#if defined(__AVX512VL__)
-  module.attr("LEVEL") = 4;
-#elif defined(__AVX2__)
-  module.attr("LEVEL") = 3;
-#elif defined(__SSE4_2__)
-  module.attr("LEVEL") = 2;
-#else
-  module.attr("LEVEL") = 0;
-#endif
+  module.attr("LEVEL") = terrainloop::instruction_level();
   module.def("surf", &terrainloop::surf_extract, "image"_a, "mask"_a = nb::none(), nb::kw_only(),
              "threshold"_a = 0.0, "octaves"_a = 4, "intervals"_a = 4, "max_keypoints"_a = nb::none());
   module.def("gp_predict_grid", &terrainloop::gp_predict_grid, "xy"_a, "elevation"_a, "noise"_a,
@@ -168,7 +145,7 @@ NB_MODULE(TERRAINLOOP_MODULE, module) {
   module.def("gp_predict_at", &terrainloop::gp_predict_at, "xy"_a, "elevation"_a, "noise"_a, nb::kw_only(),
              "length_scale"_a, "variance"_a, "queries"_a, "threads"_a = 1);
   module.def("gp_noise_ratio", &terrainloop::gp_noise_ratio, "xy"_a, "elevation"_a, nb::kw_only(), "cell"_a,
-             "threads"_a = 1);
+             "smallest_scatter"_a = 0.0, "threads"_a = 1);
   module.def("gp_block_likelihood", &terrainloop::gp_block_likelihood, "surfaces"_a, nb::kw_only(),
              "length_scale"_a, "variance"_a, "noise"_a, "side"_a, "work"_a, "threads"_a = 1);
   module.def("fast_hessian", &terrainloop::fast_hessian, "image"_a, "filter_size"_a);

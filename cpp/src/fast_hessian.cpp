@@ -151,8 +151,8 @@ std::vector<Keypoint> detect(const IntegralImage& integral, ImageView<std::uint8
   return keypoints;
 }
 
-std::vector<double> fast_hessian(ImageView<float> image, int filter_size) {
-  return make_layer(IntegralImage(image), filter_size, 1).values;
+std::vector<double> response_map(const IntegralImage& integral, int filter_size) {
+  return make_layer(integral, filter_size, 1).values;
 }
 
 }  // namespace terrainloop::surf

@@ -2,7 +2,7 @@
 
 #include <vector>
 
-#include "terrainloop/integral_image.hpp"
+#include "integral_image.hpp"
 #include "terrainloop/surf.hpp"
 
 namespace terrainloop::surf {
@@ -11,5 +11,8 @@ namespace terrainloop::surf {
 /// is left 0. In scan order.
 std::vector<Keypoint> detect(const IntegralImage& integral, ImageView<std::uint8_t> mask,
                              const Settings& settings);
+
+/// Responses of one filter at every pixel, 0 where it reaches over the border.
+std::vector<double> response_map(const IntegralImage& integral, int filter_size);
 
 }  // namespace terrainloop::surf

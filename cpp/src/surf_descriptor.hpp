@@ -1,6 +1,6 @@
 #pragma once
 
-#include "terrainloop/integral_image.hpp"
+#include "integral_image.hpp"
 #include "terrainloop/surf.hpp"
 
 namespace terrainloop::surf {

@@ -117,7 +117,7 @@ TEST(Information, IsThatOfTheDenseDesignMatrix) {
   const Eigen::VectorXd weight = Eigen::Map<const Eigen::ArrayXd>(noise.data(), count).square().inverse();
   const Eigen::VectorXd z = Eigen::Map<const Eigen::VectorXd>(elevation.data(), count);
 
-  Workers workers(2);
+  ThreadPool workers(2);
   const BinnedPoints binned = bin({xy.data(), elevation.data(), noise.data(), elevation.size()}, lattice);
   EXPECT_EQ(binned.points.size(), static_cast<std::size_t>(count));
   const Information information(binned, lattice, workers);

@@ -3,7 +3,7 @@
 #include <random>
 #include <vector>
 
-#include "terrainloop/integral_image.hpp"
+#include "integral_image.hpp"
 
 namespace terrainloop {
 namespace {

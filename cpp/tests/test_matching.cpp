@@ -7,10 +7,10 @@
 #include <vector>
 
 #include "matching/fft.hpp"
+#include "matching/search.hpp"
 #include "terrainloop/field.hpp"
 #include "terrainloop/inliers.hpp"
 #include "terrainloop/refine.hpp"
-#include "terrainloop/search.hpp"
 
 namespace terrainloop {
 namespace {

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from terrainloop.gp.kernel import Hyperparameters
     from terrainloop.gp.process import ElevationProcess
     from terrainloop.gradient_map import GradientMap
-    from terrainloop.io.clouds import read_cloud, write_cloud
+    from terrainloop.io.clouds import read_cloud, read_crs, write_cloud
     from terrainloop.io.missions import Mission, load_mission
     from terrainloop.loop import LoopCandidate
     from terrainloop.matching.register import register
@@ -38,6 +38,7 @@ _HOME = {
     "fit_hyperparameters": "gp.hyperparameters",
     "load_mission": "io.missions",
     "read_cloud": "io.clouds",
+    "read_crs": "io.clouds",
     "register": "matching.register",
     "write_cloud": "io.clouds",
 }
@@ -58,6 +59,7 @@ __all__ = [
     "fit_hyperparameters",
     "load_mission",
     "read_cloud",
+    "read_crs",
     "register",
     "write_cloud",
 ]

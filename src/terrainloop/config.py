@@ -1,12 +1,15 @@
 """Settings: few, in metres or dimensionless, derived from one another where they can be."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from terrainloop.errors import TerrainLoopError
+from terrainloop.strict_yaml import read_yaml
+
+_LONGEST_QUOTE = 120  # characters of a file or of a validator's message that an error quotes
 
 
 class _Frozen(BaseModel):
@@ -20,16 +23,22 @@ class MapSettings(_Frozen):
         "spline", description="spline: every point, in milliseconds; exact: dense, for a few thousand points"
     )
     max_points: int | None = Field(
-        None, ge=50, description="points kept per submap, drawn at random; null: all"
+        None, ge=50, le=10**9, description="points kept per submap, drawn at random; null: all"
     )
     fit_points: int | None = Field(
-        5000, ge=50, description="points per submap that hyperparameters are fitted on; null: all"
+        5000, ge=50, le=10**9, description="points per submap that hyperparameters are fitted on; null: all"
     )
     length_scale: float | None = Field(
-        None, gt=0, description="starting length scale of the kernel, m; null: twice the point spacing"
+        None,
+        ge=1e-4,
+        le=1e4,
+        description="starting length scale of the kernel, m; null: twice the point spacing",
     )
     noise: float | None = Field(
-        None, gt=0, description="starting accuracy of the elevations, m; null: a fifth of the relief"
+        None,
+        ge=1e-9,
+        le=1e4,
+        description="starting accuracy of the elevations, m; null: a fifth of the relief",
     )
     local_noise: bool = Field(
         True, description="scale each point's noise by the scatter and the number of the points around it"
@@ -38,7 +47,7 @@ class MapSettings(_Frozen):
         "database", description="maximise the likelihood once (maps stay comparable) or for every submap"
     )
     resolution: float | None = Field(
-        None, gt=0, description="grid spacing, m per pixel; null: a sixth of the length scale"
+        None, ge=1e-5, le=1e4, description="grid spacing, m per pixel; null: a sixth of the length scale"
     )
     remove_plane: bool = Field(
         True, description="subtract a robust plane fit, and drop gross outliers, before; add its slope after"
@@ -55,7 +64,7 @@ class FeatureSettings(_Frozen):
     """Keypoints on the gradient map."""
 
     kind: Literal["surf", "sift", "orb"] = Field("sift", description="detector and descriptor")
-    max_keypoints: int = Field(500, ge=2, description="strongest keypoints kept per map")
+    max_keypoints: int = Field(500, ge=2, le=10**5, description="strongest keypoints kept per map")
 
 
 class MatchSettings(_Frozen):
@@ -65,19 +74,26 @@ class MatchSettings(_Frozen):
         "evidence", description="evidence: number of false alarms; inliers: Algorithm 1 of the paper"
     )
     max_false_loops: float = Field(
-        0.01, gt=0, description="evidence: expected number of false loop closures per mission"
+        0.01, gt=0, le=1e6, description="evidence: expected number of false loop closures per mission"
     )
-    iterations: int = Field(5000, ge=1, description="RANSAC draws of two keypoint associations")
+    iterations: int = Field(5000, ge=1, le=10**7, description="RANSAC draws of two keypoint associations")
     inlier_radius: float | None = Field(
-        None, gt=0, description="largest distance of an inlier, m; null: half the length scale"
+        None, ge=1e-5, le=1e5, description="largest distance of an inlier, m; null: half the length scale"
     )
-    min_inliers: int = Field(5, ge=2, description="inliers: minimum number of inliers, n_min")
+    min_inliers: int = Field(5, ge=2, le=10**6, description="inliers: minimum number of inliers, n_min")
     max_ssd_ratio: float = Field(
-        0.5, gt=0, description="inliers: largest SSD, as a share of what unrelated ground would give"
+        0.5, gt=0, le=1e6, description="inliers: largest SSD, as a share of what unrelated ground would give"
     )
     refine: bool = Field(
         True, description="inliers: refine the pose by least squares on all overlapping gradients"
     )
+
+
+def _from_list(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+_Triple = Annotated[tuple[float, float, float], BeforeValidator(_from_list)]  # YAML has lists only
 
 
 class Calibration(_Frozen):
@@ -116,10 +132,10 @@ class Calibration(_Frozen):
     block: float = Field(2.0, gt=0, description="side of the independent blocks of ground, length scales")
     usual_strain: float = Field(0.004, ge=0, description="standard deviation of a submap's strain, a priori")
     usual_strain_samples: float = Field(3.0, gt=0, description="samples that this prior is worth")
-    motion_by_strain: tuple[float, float, float] = Field(
+    motion_by_strain: _Triple = Field(
         (2.0, 2.0, 0.5), description="variance of x, y, z per squared metre of reach, per strain variance"
     )
-    rotation_by_strain: tuple[float, float, float] = Field(
+    rotation_by_strain: _Triple = Field(
         (0.7, 0.7, 8.0), description="variance of roll, pitch, yaw per strain variance"
     )
 
@@ -130,13 +146,16 @@ class Settings(_Frozen):
     ``Settings(max_false_loops=0.1)`` is short for ``Settings(match={"max_false_loops": 0.1})``.
     """
 
+    # The comments of YAML sections are Field descriptions; docstrings are gone under python -OO.
     map: MapSettings = Field(MapSettings(), description="how a submap becomes a gradient map")
     features: FeatureSettings = Field(FeatureSettings(), description="keypoints on the gradient map")
     match: MatchSettings = Field(
         MatchSettings(), description="how two maps are compared, and what makes a loop closure"
     )
-    skip_recent: int = Field(1, ge=0, description="submaps just before the query that are not compared")
-    seed: int = Field(0, ge=0, description="seed of the random number generator")
+    skip_recent: int = Field(
+        1, ge=0, le=10**6, description="submaps just before the query that are not compared"
+    )
+    seed: int = Field(0, ge=0, lt=2**63, description="seed of the random number generator")
     calibration: Calibration = Field(
         Calibration(), description="measured constants, see docs/calibration.md; not meant to be changed"
     )
@@ -209,20 +228,16 @@ class Settings(_Frozen):
         TerrainLoopError
             If the file cannot be read, is no YAML mapping, or holds an unknown or impossible value.
         """
-        mend = "start from the output of 'terrainloop config'"
+        content = read_yaml(path)
         try:
-            content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise TerrainLoopError(
-                expected=f"YAML settings in {path}", found=_line(error), mend=mend
-            ) from error
-        try:
-            return cls.model_validate({} if content is None else content)
+            return cls.model_validate({} if content is None else content, strict=True)
         except ValidationError as error:
             first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"]) or "the file"
+            where = "".join(c for c in ".".join(map(str, first["loc"])) if c.isprintable()) or "the file"
             raise TerrainLoopError(
-                expected=f"valid settings in {path}", found=f"{where}: {first['msg'].lower()}", mend=mend
+                expected=f"valid settings in {path}",
+                found=f"{where[:_LONGEST_QUOTE]}: {first['msg'].lower()[:_LONGEST_QUOTE]}",
+                mend="start from the output of 'terrainloop config'",
             ) from error
 
     def to_yaml(self) -> str:
@@ -241,7 +256,3 @@ def _yaml_lines(model: BaseModel, indent: str) -> list[str]:
             scalar = yaml.safe_dump(plain, default_flow_style=True).removesuffix("...\n").strip()
             lines.append(f"{indent}{name}: {scalar}  # {field.description}")
     return lines
-
-
-def _line(text: object) -> str:
-    return " ".join(str(text).split())

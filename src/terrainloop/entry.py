@@ -2,6 +2,8 @@
 
 import io
 import json
+import zipfile
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -13,6 +15,9 @@ from terrainloop.features import Features, extract_features
 from terrainloop.field import Field, field_of, field_spacing
 from terrainloop.gradient_map import GradientMap
 from terrainloop.record import SubmapRecord
+
+_DESCRIPTORS = {"surf": (64, np.float32), "sift": (128, np.float32), "orb": (32, np.uint8)}
+"""Width and type of the descriptors by kind of features."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +60,20 @@ class MapEntry:
         """Unique among all sessions: ``session/name``, or the name where there is one session only."""
         return f"{self.record.session}/{self.name}" if self.record.session else self.name
 
+    @property
+    def summary(self) -> str:
+        """What was mapped, with which hyperparameters, and what was repaired, in one line."""
+        p, (rows, columns) = self.gradient_map.parameters, self.gradient_map.mask.shape
+        facts = [
+            f"{self.record.points} points",
+            f"{columns} x {rows} pixels of {self.gradient_map.resolution:.3g} m",
+            f"{self.gradient_map.mask.mean():.0%} observed",
+            f"{len(self.features)} keypoints",
+            f"length scale {p.length_scale:.3g} m, relief {p.variance**0.5:.3g} m, noise {p.noise:.2g} m",
+        ]
+        repairs = f"; {self.record.notes}" if self.record.notes else ""
+        return f"{self.name}: {', '.join(facts)}{repairs}"
+
     def field_at(self, spacing: float, settings: Settings) -> Field:
         """The field at `spacing` metres per pixel; the stored one where that is its spacing."""
         if spacing == self.field.spacing:
@@ -83,20 +102,20 @@ class MapEntry:
             If the bytes are no such entry.
         """
         try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-                record = json.loads(arrays["record"].tobytes())
-                record["hull"] = np.array(record["hull"], dtype=float).reshape(-1, 2)
-                if record["odometry"] is not None:
-                    record["odometry"] = np.array(record["odometry"], dtype=float).reshape(4, 4)
+            with zipfile.ZipFile(io.BytesIO(data)) as file:
+
+                def array(name: str) -> np.ndarray[Any, Any]:
+                    return _array(file, f"{name}.npy")
+
                 return cls(
-                    SubmapRecord(**record),
-                    GradientMap.from_bytes(arrays["map"].tobytes()),
-                    Features(**_part(arrays, "features", Features)),
-                    Field(**_part(arrays, "field", Field)),
+                    _record(array("record").tobytes()),
+                    GradientMap.from_bytes(array("map").tobytes()),
+                    _checked_features(Features(**_part(array, "features", Features))),
+                    _checked_field(Field(**_part(array, "field", Field))),
                 )
         except TerrainLoopError:
             raise
-        except Exception as error:  # what NumPy and zipfile raise on damaged data is not documented
+        except Exception as error:  # what zipfile and NumPy raise on damaged data is not documented
             raise TerrainLoopError(
                 expected="the bytes of a map entry",
                 found=" ".join(str(error).split()) or type(error).__name__,
@@ -104,13 +123,72 @@ class MapEntry:
             ) from error
 
 
-def _part(arrays: Any, prefix: str, kind: type[Any]) -> dict[str, Any]:
+def _array(file: zipfile.ZipFile, name: str) -> np.ndarray[Any, Any]:
+    """An array as `numpy.savez` stores it, of no more bytes than there are, whatever its header announces."""
+    if file.getinfo(name).compress_type != zipfile.ZIP_STORED:
+        raise ValueError(f"{name} is compressed")
+    content = io.BytesIO(file.read(name))
+    if np.lib.format.read_magic(content) != (1, 0):
+        raise ValueError(f"{name} has another version")
+    shape, by_columns, dtype = np.lib.format.read_array_header_1_0(content)
+    values = np.frombuffer(content.read(), dtype).copy()
+    return values.reshape(shape, order="F" if by_columns else "C")
+
+
+def _record(data: bytes) -> SubmapRecord:
+    content = json.loads(data)
+    content["hull"] = np.array(content["hull"], dtype=float).reshape(-1, 2)
+    if content["odometry"] is not None:
+        content["odometry"] = np.array(content["odometry"], dtype=float).reshape(4, 4)
+    record = SubmapRecord(**content)
+    labels, numbers = (
+        (record.name, record.status, record.notes, record.session),
+        (record.stamp, record.points),
+    )
+    if not all(isinstance(label, str) for label in labels) or not all(
+        isinstance(number, int | float) for number in numbers
+    ):
+        raise ValueError("a record of other types")
+    return record
+
+
+def _part(array: Callable[[str], Any], prefix: str, kind: type[Any]) -> dict[str, Any]:
     """Fields of a data class from their arrays; scalars, strings and pairs as such."""
-    values = {f.name: arrays[f"{prefix}.{f.name}"] for f in fields(kind)}
+    values = {f.name: array(f"{prefix}.{f.name}") for f in fields(kind)}
     return {
         name: value.item() if value.ndim == 0 else tuple(value.tolist()) if name == "origin" else value
         for name, value in values.items()
     }
+
+
+def _checked_features(features: Features) -> Features:
+    """The features, if their arrays fit together: the compiled core would read beyond them."""
+    count = len(features.positions)
+    width, kind_of_number = _DESCRIPTORS[features.kind]
+    vectors = (features.scales, features.orientations, features.responses)
+    if (
+        features.positions.shape != (count, 2)
+        or any(vector.shape != (count,) for vector in vectors)
+        or any(array.dtype != np.float64 for array in (features.positions, *vectors))
+        or features.descriptors.shape != (count, width)
+        or features.descriptors.dtype != kind_of_number
+    ):
+        raise ValueError("features whose arrays do not fit together")
+    return features
+
+
+def _checked_field(field: Field) -> Field:
+    images = (field.x, field.y, field.valid)
+    if (
+        field.x.ndim != 2
+        or any(image.shape != field.x.shape or image.dtype != np.float32 for image in images)
+        or not np.isfinite(field.origin).all()
+        or np.shape(field.origin) != (2,)
+        or not 0 < field.spacing < np.inf
+        or not 0 < field.length_scale < np.inf
+    ):
+        raise ValueError("a field whose parts do not fit together")
+    return field
 
 
 def _text(text: str) -> np.ndarray[Any, Any]:

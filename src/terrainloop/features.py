@@ -6,11 +6,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from terrainloop import _core
+from terrainloop.arrays import ReadOnlyArrays, read_only
 from terrainloop.config import FeatureSettings
-from terrainloop.errors import TerrainLoopError
 from terrainloop.gradient_map import GradientMap
 
 # A map's contrast: the magnitude that all but its steepest hundredth stay below. Thresholds and grey
@@ -28,7 +28,7 @@ _Detected = tuple[NDArray[np.float64], NDArray[Any]]
 
 
 @dataclass(frozen=True, eq=False)
-class Features:
+class Features(ReadOnlyArrays):
     """Keypoints of one gradient map and their descriptors, strongest first.
 
     Parameters
@@ -56,6 +56,10 @@ class Features:
     descriptors: NDArray[np.float32] | NDArray[np.uint8]
     kind: str
 
+    def __post_init__(self) -> None:
+        for name in ("positions", "scales", "orientations", "responses", "descriptors"):
+            object.__setattr__(self, name, read_only(np.asarray(getattr(self, name))))
+
     def __len__(self) -> int:
         return len(self.positions)
 
@@ -71,13 +75,8 @@ def extract_features(gradient_map: GradientMap, settings: FeatureSettings) -> Fe
     gradient_map : GradientMap
     settings : FeatureSettings
         Kind and number: the strongest are kept; of equal ones those of smaller y, then x.
-
-    Raises
-    ------
-    TerrainLoopError
-        If the magnitude is not finite everywhere.
     """
-    image, allowed = _checked(gradient_map.magnitude, gradient_map.mask)
+    image, allowed = gradient_map.magnitude, gradient_map.mask
     contrast = float(np.percentile(image[allowed], CONTRAST_PERCENTILE)) if allowed.any() else 0.0
     keypoints, descriptors = _DETECTORS[settings.kind](image, allowed, contrast, settings.max_keypoints)
     return Features(
@@ -89,24 +88,6 @@ def extract_features(gradient_map: GradientMap, settings: FeatureSettings) -> Fe
         descriptors=descriptors,
         kind=settings.kind,
     )
-
-
-def _checked(magnitude: ArrayLike, mask: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    image = np.ascontiguousarray(magnitude, dtype=np.float32)
-    allowed = np.ascontiguousarray(mask, dtype=bool)
-    if image.ndim != 2 or image.size == 0 or allowed.shape != image.shape:
-        raise TerrainLoopError(
-            expected="a magnitude image (rows, cols) and a mask of the same shape",
-            found=f"shapes {np.shape(magnitude)} and {np.shape(mask)}",
-            mend="pass both from one gradient map",
-        )
-    if not np.isfinite(image).all():
-        raise TerrainLoopError(
-            expected="finite magnitudes, also outside the mask",
-            found=f"{np.count_nonzero(~np.isfinite(image))} that are not",
-            mend="fill them and mark them false in the mask",
-        )
-    return image, allowed
 
 
 def _surf(image: NDArray[np.float32], allowed: NDArray[np.bool_], contrast: float, count: int) -> _Detected:

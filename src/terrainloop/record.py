@@ -26,7 +26,7 @@ class SubmapRecord:
         Corners, anticlockwise, of the convex hull of x and y in the submap's own frame, metres, rounded to
         millimetres; empty if broken.
     notes : str
-        What was repaired on the way in, or what is wrong.
+        Repairs and warnings, or what is wrong.
     session : str
         Name of the session the submap belongs to; empty if there is only one.
     odometry : array, (4, 4), or None
@@ -50,7 +50,7 @@ class SubmapRecord:
             stamp=submap.stamp,
             points=len(submap),
             hull=_hull_of(submap.points[:, :2]),
-            notes="; ".join(submap.repairs),
+            notes="; ".join([*submap.repairs, *submap.warnings]),
             session=submap.session,
             odometry=odometry,
         )

@@ -1,12 +1,16 @@
-"""Submaps: gravity-aligned point clouds, one a place, checked and cleaned on the way in."""
+"""Submaps: gravity-aligned point clouds, one for each place, checked and cleaned on the way in."""
 
 import logging
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from terrainloop.arrays import ReadOnlyArrays, read_only
 from terrainloop.errors import TerrainLoopError
+from terrainloop.isolated import isolated_points
+from terrainloop.plausibility import plausibility_warnings
 
 logger = logging.getLogger(__name__)
 
@@ -28,8 +32,8 @@ _STEEPEST = np.radians(70.0)  # a surface steeper than this is no ground
 _TALLEST = 3.0  # height over width of what surely is no ground
 
 
-@dataclass(frozen=True, eq=False)
-class Submap:
+@dataclass(frozen=True, eq=False, repr=False)
+class Submap(ReadOnlyArrays):
     """A point cloud in its own gravity-aligned frame (z up), fit to be mapped.
 
     Parameters
@@ -46,11 +50,16 @@ class Submap:
     repairs : tuple of str
         What was repaired on the way in, in words; what construction repairs is added and logged.
 
+    Attributes
+    ----------
+    warnings : tuple of str
+        What is unlikely for a submap of the ground, in words (see `plausibility_warnings`); logged, too.
+
     Raises
     ------
     TerrainLoopError
         Where no elevation map could come of the points: wrong shape, fewer than `MIN_POINTS`, no area,
-        millimetres, coordinates too large for their type, z not up.
+        millimetres, coordinates too large for their type, z not up; or a name, session or stamp that is none.
     """
 
     points: Array
@@ -59,16 +68,19 @@ class Submap:
     stamp: float = 0.0
     intensity: Array | None = None
     repairs: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = field(init=False, default=())
 
     def __post_init__(self) -> None:
         _check_label("name", self.name)
-        if self.session:
+        if self.session != "":
             _check_label("session", self.session)
+        _check_stamp(self.stamp)
         given = _numbers(self.points)
         points = np.array(given, dtype=np.float64)
         intensity = None if self.intensity is None else _one_a_point(self.intensity, len(points))
         rows, repairs = _usable_rows(points)
-        points = points[rows]
+        rows, strays = _without_strays(points, rows)
+        points, repairs = points[rows], repairs + strays
         _check_count(points, repairs)
         low, high = np.percentile(points, [1, 99], axis=0)
         # Everything below looks at the bulk of the cloud: a few stray points must not decide.
@@ -77,30 +89,65 @@ class Submap:
         repairs += _check_precision(float(np.abs([low, high]).max()), given.dtype)
         _check_area(bulk)
         _check_gravity(bulk, high - low)
-        for repair in repairs:
-            logger.warning("%s: %s", self.name, repair)
-        object.__setattr__(self, "points", points)
-        object.__setattr__(self, "intensity", None if intensity is None else intensity[rows])
+        warnings = plausibility_warnings(bulk)
+        for words in [*repairs, *warnings]:
+            logger.warning("%s: %s", self.name, words)
+        object.__setattr__(self, "points", read_only(points))
+        object.__setattr__(self, "intensity", None if intensity is None else read_only(intensity[rows]))
         object.__setattr__(self, "repairs", tuple(dict.fromkeys([*self.repairs, *repairs])))
+        object.__setattr__(self, "warnings", warnings)
 
     def __len__(self) -> int:
         return len(self.points)
 
+    def __repr__(self) -> str:
+        width, depth, height = np.ptp(self.points, axis=0)
+        return f"Submap({self.name!r}, {len(self)} points, {width:.4g} x {depth:.4g} x {height:.4g} m)"
+
+
+def _without_strays(points: Array, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], list[str]]:
+    """The rows whose points are not far from all others, and what was dropped."""
+    stray = isolated_points(points[rows, :2]) if len(rows) else np.zeros(0, dtype=bool)
+    if not stray.any():
+        return rows, []
+    x, y, z = points[rows[stray][0]]
+    found = f"far from all others, such as ({x:.6g}, {y:.6g}, {z:.6g})"
+    return rows[~stray], [f"dropped {stray.sum()} of {len(points)} points: {found}"]
+
 
 def _check_label(what: str, label: str) -> None:
-    if not label.strip() or any(c in "/\\," or not c.isprintable() for c in label):
+    if (
+        not isinstance(label, str)
+        or not label.strip()
+        or any(c in "/\\," or not c.isprintable() for c in label)
+    ):
         raise TerrainLoopError(
             expected=f"a {what} without path separators, commas and control characters",
-            found=repr(label),
+            found=f"{label!r:.60}",
             mend="rename it",
+        )
+
+
+def _check_stamp(stamp: float) -> None:
+    if not isinstance(stamp, (int, float, np.integer, np.floating)) or not np.isfinite(stamp):
+        raise TerrainLoopError(
+            expected="a finite number of seconds, or the index, as the stamp",
+            found=f"{stamp!r:.60}",
+            mend="give a number, or leave it out",
         )
 
 
 def _numbers(points: ArrayLike) -> NDArray[np.generic]:
     """`points` as the numeric (N, 3) array it has to be, in the type it was given in."""
+    if isinstance(points, str | bytes | os.PathLike):
+        raise TerrainLoopError(
+            expected="points as numbers of shape (N, 3)",
+            found=f"the text or path {os.fspath(points)!r:.60}",
+            mend="read a file with terrainloop.read_cloud",
+        )
     try:
-        array = np.asarray(points)
-    except ValueError:
+        array = np.ma.filled(points, np.nan) if np.ma.isMaskedArray(points) else np.asarray(points)
+    except (TypeError, ValueError, OverflowError):
         array = np.empty(0, dtype=object)
     if array.dtype.kind not in "fiu" or array.ndim != 2 or array.shape[1] != 3:
         raise TerrainLoopError(

@@ -36,14 +36,15 @@ struct Maps {
   float* gradient_variance;  ///< mean of the variances of the two components of the gradient
 };
 
-/// Posterior on a grid, with `threads` threads in all. The bytes do not depend on their number.
+/// Posterior on a grid, with at most `threads` threads in all: no more than the machine runs at once, and as
+/// few as it lets start. The bytes do not depend on their number.
 /// Memory, beside the arguments: 48 bytes a point and at most 0.7 GB, whatever the area.
 /// Throws std::invalid_argument for numbers that make no model, std::runtime_error where the equations
 /// cannot be solved to tolerance.
 void predict_grid(const Points& points, const Hyperparameters& parameters, const Grid& grid, const Maps& maps,
                   int threads = 1);
 
-/// As predict_grid, at `count` arbitrary places: `queries` is (count, 2) row-major, metres.
+/// As predict_grid, at `count` < 2^31 arbitrary positions: `queries` is (count, 2) row-major, metres.
 void predict_at(const Points& points, const Hyperparameters& parameters, const double* queries,
                 std::size_t count, const Maps& maps, int threads = 1);
 
@@ -54,9 +55,12 @@ void predict_at(const Points& points, const Hyperparameters& parameters, const d
 /// that of stereo does with the range, so does the ratio. Points further from their cell's plane than three
 /// standard deviations have it raised by the square of the excess, so that flying pixels raise no spikes. The
 /// n points in a square of half that side have it raised by sqrt(n), so that they count as one: the errors of
-/// neighbours are much the same, and do not average out. Where the points are too sparse to tell a scatter,
-/// only the last is left. `ratio` is (count).
-void noise_ratio(const double* xy, const double* elevation, std::size_t count, double cell, double* ratio,
-                 int threads = 1);
+/// neighbours are much the same, and do not average out. Where the points are too sparse to show a scatter,
+/// only the last is left. A typical scatter below `smallest_scatter` (metres) is taken for that: on quantised
+/// elevations most cells have none. `ratio` is (count). Memory grows with the points, whatever the area.
+/// Throws std::invalid_argument for numbers that are not finite and for points over more than a million cells
+/// along an axis.
+void noise_ratio(const double* xy, const double* elevation, std::size_t count, double cell,
+                 double smallest_scatter, double* ratio, int threads = 1);
 
 }  // namespace terrainloop::gp

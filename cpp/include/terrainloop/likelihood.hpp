@@ -24,8 +24,8 @@ class BlockLikelihood {
   ~BlockLikelihood();
 
   /// -log p(z), and its derivatives by the logarithms of length scale, variance and noise. The bytes do not
-  /// depend on the number of threads. One call at a time. Throws std::runtime_error where a covariance cannot
-  /// be factorised.
+  /// depend on the number of threads. Calls take turns. Throws std::invalid_argument for numbers that are not
+  /// positive, std::runtime_error where a covariance cannot be factorised.
   std::array<double, 4> operator()(const Hyperparameters& parameters, double noise) const;
 
   int points() const;  ///< in the blocks

@@ -24,8 +24,8 @@ using Descriptor = std::array<float, 64>;
 
 struct Settings {
   double threshold = 0.0;  ///< the response of a keypoint exceeds it; >= 0
-  int octaves = 4;         ///< each doubles the sampling step and the growth of the filters; >= 1
-  int intervals = 4;       ///< filter sizes in an octave; >= 3, for the first and last only bound the others
+  int octaves = 4;         ///< each doubles the sampling step and the growth of the filters; 1 ... 16
+  int intervals = 4;  ///< filter sizes in an octave; 3 ... 16, as the first and last only bound the others
   std::size_t max_keypoints = std::numeric_limits<std::size_t>::max();  ///< the strongest are kept
 };
 
@@ -34,12 +34,14 @@ struct Features {
   std::vector<Descriptor> descriptors;
 };
 
-/// Keypoints of a finite image and their descriptors. Keypoints lie at the pixels where mask is not 0; an
-/// empty mask (no data) allows all. No keypoint arises where a filter that is needed reaches over the border.
+/// Keypoints of an image and their descriptors. Keypoints are at the pixels where mask is not 0; a mask
+/// without data allows all. There is no keypoint where a filter that is needed reaches over the border.
+/// Throws std::invalid_argument for an image that is not finite, a mask of another shape, and impossible
+/// settings.
 Features extract(ImageView<float> image, ImageView<std::uint8_t> mask, const Settings& settings);
 
 /// Response map (rows x cols) of one box filter of odd lobe size: filter_size = 9, 15, 21, ... pixels; 0
-/// where the filter reaches over the border.
+/// where the filter reaches over the border. Throws std::invalid_argument for other sizes.
 std::vector<double> fast_hessian(ImageView<float> image, int filter_size);
 
 }  // namespace terrainloop::surf

@@ -2,13 +2,15 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <numeric>
 #include <stdexcept>
 #include <utility>
 
+#include "checks.hpp"
 #include "prior.hpp"
+#include "thread_pool.hpp"
 #include "triangular.hpp"
-#include "workers.hpp"
 
 namespace terrainloop::gp {
 namespace {
@@ -23,6 +25,13 @@ constexpr double kJitter = 1e-11;  // variance of every component, as a share of
 constexpr double kSpread[] = {0.75487766624669, 0.56984029099805};  // multiples fill the unit square evenly
 constexpr std::size_t kChunk = 256;                                 // points at once
 const double kLogTwoPi = std::log(2.0 * std::acos(-1.0));
+
+// Eigen compiles new code for every form of expression: two of them keep the build short.
+Matrix product(const Matrix& a, const Matrix& b) { return a * b; }
+Matrix transposed_product(const Matrix& a, const Matrix& b) { return a.transpose() * b; }
+
+/// B' A B
+Matrix sandwich(const Matrix& a, const Matrix& b) { return product(transposed_product(b, a), b); }
 
 /// Legendre polynomials on [-1, 1], orthonormal under the mean over it: (places, count).
 Matrix legendre(const Vector& at, int count) {
@@ -102,14 +111,6 @@ struct Patch {
   double turn;  ///< in [0, 1), even over the ground: those below a share make an even part
 };
 
-void check(const Points& points) {
-  if (points.count == 0) throw std::invalid_argument("there must be at least one point");
-  for (std::size_t i = 0; i < points.count; ++i)
-    if (!std::isfinite(points.xy[2 * i]) || !std::isfinite(points.xy[2 * i + 1]) ||
-        !std::isfinite(points.elevation[i]) || !(points.noise[i] > 0.0) || !std::isfinite(points.noise[i]))
-      throw std::invalid_argument("points must be finite, and their noise positive");
-}
-
 /// Blocks of a grid over the middle of a surface, without those that hold no point.
 void cut(const Points& surface, double side, std::vector<Patch>& patches) {
   double low[2], count[2];
@@ -164,7 +165,7 @@ struct BlockLikelihood::Statistics {
   double side;
   std::unique_ptr<Components> components;
   std::vector<Block> blocks;
-  mutable Workers workers;
+  mutable ThreadPool workers;
 
   Statistics(double side, int threads) : side(side), workers(threads) {}
 
@@ -176,20 +177,20 @@ struct BlockLikelihood::Statistics {
     });
     const Vector root = quadrature.values.col(0);
     const Matrix kernel = root.asDiagonal() * Matrix((-0.5 * scaled.array()).exp()) * root.asDiagonal();
-    const auto v = quadrature.values.leftCols(kDegrees);
-    return {v.transpose() * kernel * v, v.transpose() * kernel.cwiseProduct(scaled) * v};
+    const Matrix v = quadrature.values.leftCols(kDegrees);
+    return {sandwich(kernel, v), sandwich(kernel.cwiseProduct(scaled), v)};
   }
 
   /// Integrals of products of two components along an axis and a polynomial: (pairs, moments).
   Matrix triple_products() const {
-    const Matrix values = quadrature.values.leftCols(kDegrees) * components->basis;
+    const Matrix values = product(quadrature.values.leftCols(kDegrees), components->basis);
     const int count = static_cast<int>(values.cols());
     Matrix products(count * (count + 1) / 2, kNodes);
     for (int i = 0; i < count; ++i)
       for (int j = 0; j <= i; ++j)
         products.row(pair(i, j)) =
             (values.col(i).array() * values.col(j).array() / quadrature.values.col(0).array()).matrix();
-    return products * quadrature.values;
+    return product(products, quadrature.values);
   }
 
   Prior prior(double length_scale) const;
@@ -199,8 +200,8 @@ struct BlockLikelihood::Statistics {
 
 Prior BlockLikelihood::Statistics::prior(double length_scale) const {
   auto [along, by_length_scale] = covariance(length_scale);
-  along = components->basis.transpose() * along * components->basis;
-  by_length_scale = components->basis.transpose() * by_length_scale * components->basis;
+  along = sandwich(along, components->basis);
+  by_length_scale = sandwich(by_length_scale, components->basis);
   Matrix c = components->product(along, along);
   c.diagonal().array() += kJitter;
   const Matrix dc = components->product(along, by_length_scale) + components->product(by_length_scale, along);
@@ -208,7 +209,7 @@ Prior BlockLikelihood::Statistics::prior(double length_scale) const {
   if (factor.info() != Eigen::Success) throw std::runtime_error("the prior is not positive definite");
   Prior prior;
   prior.precision = factor.solve(Matrix::Identity(c.rows(), c.cols()));
-  prior.by_length_scale = -(prior.precision * dc * prior.precision);
+  prior.by_length_scale = -product(product(prior.precision, dc), prior.precision);
   prior.folded_precision = folded(prior.precision);
   prior.folded_by_length_scale = folded(prior.by_length_scale);
   prior.log_determinant = 2.0 * factor.matrixLLT().diagonal().array().log().sum();
@@ -228,17 +229,17 @@ Block BlockLikelihood::Statistics::block(const Patch& patch, const Matrix& produ
       const double z = patch.surface->elevation[i], omega = patch.surface->noise[i];
       x[k] = 2.0 * (patch.surface->xy[2 * i] - patch.x) / side;
       y[k] = 2.0 * (patch.surface->xy[2 * i + 1] - patch.y) / side;
-      weight[k] = 1.0 / (omega * omega);
+      weight[k] = 1.0 / std::max(omega * omega, std::numeric_limits<double>::min());
       weighted[k] = weight[k] * z;
       block.square += weighted[k] * z;
       block.log_noise += 2.0 * std::log(omega);
     }
     const Matrix in_x = legendre(x, kMoments), in_y = legendre(y, kMoments);
-    moments += in_y.transpose() * weight.asDiagonal() * in_x;
-    first += in_y.leftCols(kDegrees).transpose() * weighted.asDiagonal() * in_x.leftCols(kDegrees);
+    moments += transposed_product(weight.asDiagonal() * in_y, in_x);
+    first += transposed_product(weighted.asDiagonal() * in_y.leftCols(kDegrees), in_x.leftCols(kDegrees));
   }
-  const Matrix pairs = products * moments * products.transpose();
-  first = components->basis.transpose() * first * components->basis;
+  const Matrix pairs = product(product(products, moments), products.transpose());
+  first = sandwich(first, components->basis);
   const std::vector<int>&in_y = components->in_y, &in_x = components->in_x;
   const int rank = components->rank();
   block.information = Matrix::NullaryExpr(rank, rank, [&](Eigen::Index i, Eigen::Index j) {
@@ -250,7 +251,7 @@ Block BlockLikelihood::Statistics::block(const Patch& patch, const Matrix& produ
 
 Terms BlockLikelihood::Statistics::terms(const Block& block, const Prior& prior, double variance,
                                          double noise) const {
-  const double s2 = noise * noise;
+  const double s2 = std::max(noise * noise, std::numeric_limits<double>::min());
   const auto rank = static_cast<double>(prior.precision.rows());
   Matrix lower = prior.precision / variance + block.information / s2;
   const Eigen::LLT<Eigen::Ref<Matrix>> factor(lower);
@@ -277,12 +278,13 @@ Terms BlockLikelihood::Statistics::terms(const Block& block, const Prior& prior,
 BlockLikelihood::BlockLikelihood(const std::vector<Points>& surfaces, const Hyperparameters& about,
                                  double noise, double side, double work, int threads) {
   for (const double value : {about.length_scale, about.variance, noise, side, work})
-    if (!(value > 0.0 && std::isfinite(value))) throw std::invalid_argument("numbers must be positive");
-  if (threads < 1) throw std::invalid_argument("threads must be >= 1");
+    if (!positive(value)) throw std::invalid_argument("numbers must be positive");
+  check_threads(threads);
+  if (surfaces.empty()) throw std::invalid_argument("there must be at least one surface");
   std::vector<Patch> patches;
   std::size_t count = 0;
   for (const Points& surface : surfaces) {
-    check(surface);
+    check_points(surface);
     cut(surface, side, patches);
     count += surface.count;
   }
@@ -306,6 +308,8 @@ BlockLikelihood::BlockLikelihood(const std::vector<Points>& surfaces, const Hype
 BlockLikelihood::~BlockLikelihood() = default;
 
 std::array<double, 4> BlockLikelihood::operator()(const Hyperparameters& parameters, double noise) const {
+  for (const double value : {parameters.length_scale, parameters.variance, noise})
+    if (!positive(value)) throw std::invalid_argument("numbers must be positive");
   const Prior prior = statistics_->prior(parameters.length_scale);
   const std::vector<Block>& blocks = statistics_->blocks;
   std::vector<Terms> terms(blocks.size());

@@ -1,12 +1,14 @@
 #include <Eigen/Dense>
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <stdexcept>
 #include <vector>
 
 #include "cells.hpp"
+#include "checks.hpp"
 #include "terrainloop/gp.hpp"
-#include "workers.hpp"
+#include "thread_pool.hpp"
 
 namespace terrainloop::gp {
 namespace {
@@ -18,24 +20,13 @@ constexpr int kRefits = 3;
 constexpr double kPooling = 2.0;   // standard deviation of the weights of neighbouring cells, in cells
 constexpr int kFarthest = 6;       // cells that are pooled, on each side
 constexpr double kSmallest = 0.3;  // of the typical noise: no ground is known much better than the rest
+constexpr double kLargest = 1e50;  // nor anything so badly that it is no number
 constexpr double kOutlier = 3.0;   // standard deviations from which a point counts as an outlier
 
 double median(std::vector<double>& values) {
   const auto middle = values.begin() + values.size() / 2;
   std::nth_element(values.begin(), middle, values.end());
   return *middle;
-}
-
-CellGrid cells_over(const double* xy, std::size_t count, double side) {
-  double low[2] = {xy[0], xy[1]}, high[2] = {xy[0], xy[1]};
-  for (std::size_t i = 0; i < 2 * count; ++i) {
-    low[i % 2] = std::min(low[i % 2], xy[i]);
-    high[i % 2] = std::max(high[i % 2], xy[i]);
-  }
-  const double cols = std::floor((high[0] - low[0]) / side) + 1.0;
-  const double rows = std::floor((high[1] - low[1]) / side) + 1.0;
-  if (!(rows * cols < 1e7)) throw std::invalid_argument("the extent must be below ten million cells");
-  return {low[0], low[1], side, static_cast<int>(rows), static_cast<int>(cols)};
 }
 
 /// Distances of some points from the plane that most of them lie on, and their robust standard deviation.
@@ -69,63 +60,101 @@ double scatter(const double* xy, const double* elevation, const std::size_t* beg
   return deviation * std::sqrt(count / (count - 3.0));
 }
 
-/// Weighted mean of the variances of neighbouring cells; 0 where none is known.
-Eigen::ArrayXXd pool(const Eigen::ArrayXXd& variance, const Eigen::ArrayXXd& known) {
-  const auto smooth = [](const Eigen::ArrayXXd& image) {
-    Eigen::ArrayXXd along = Eigen::ArrayXXd::Zero(image.rows(), image.cols()), both = along;
-    for (int d = -kFarthest; d <= kFarthest; ++d) {
-      const double weight = std::exp(-0.5 * d * d / (kPooling * kPooling));
-      const Eigen::Index rows = image.rows() - std::abs(d);
-      if (rows > 0)
-        along.middleRows(std::max(0, d), rows) += weight * image.middleRows(std::max(0, -d), rows);
+/// The scatter in each cell, 0 where it is not known.
+struct Scatter {
+  std::vector<double> variance, known;  ///< known is 1 or 0
+  std::vector<double> residuals;        ///< of each point
+};
+
+Scatter measure_scatter(const double* xy, const double* elevation, const OccupiedCells& cells,
+                        ThreadPool& workers) {
+  const std::size_t count = cells.col.size();
+  Scatter found{std::vector<double>(count, 0.0), std::vector<double>(count, 0.0),
+                std::vector<double>(cells.indices.size(), 0.0)};
+  workers.run(cells.grid.rows, [&](int row) {
+    for (std::size_t c = cells.row_first[row]; c < cells.row_first[row + 1]; ++c) {
+      const std::size_t *begin = cells.indices.data() + cells.first[c],
+                        *end = cells.indices.data() + cells.first[c + 1];
+      if (static_cast<std::size_t>(end - begin) < kFewest) continue;
+      const double deviation = scatter(xy, elevation, begin, end, cells.grid.side, found.residuals.data());
+      found.variance[c] = deviation * deviation;
+      found.known[c] = 1.0;
     }
-    for (int d = -kFarthest; d <= kFarthest; ++d) {
-      const double weight = std::exp(-0.5 * d * d / (kPooling * kPooling));
-      const Eigen::Index cols = image.cols() - std::abs(d);
-      if (cols > 0) both.middleCols(std::max(0, d), cols) += weight * along.middleCols(std::max(0, -d), cols);
+  });
+  return found;
+}
+
+/// Standard deviations from the weighted mean of the variances around each cell of a row; 0 where none is
+/// known.
+void pool_row(const OccupiedCells& cells, int row, const Scatter& scatter, std::vector<double>& deviation) {
+  std::array<double, kFarthest + 1> weights;
+  for (int d = 0; d <= kFarthest; ++d) weights[d] = std::exp(-0.5 * d * d / (kPooling * kPooling));
+  const int lowest = std::max(0, row - kFarthest), highest = std::min(cells.grid.rows - 1, row + kFarthest);
+  std::array<std::size_t, 2 * kFarthest + 1> last;  // one past those of the row that are within reach
+  for (int r = lowest; r <= highest; ++r) last[r - lowest] = cells.row_first[r];
+  for (std::size_t c = cells.row_first[row]; c < cells.row_first[row + 1]; ++c) {
+    const int col = cells.col[c];
+    double variance = 0.0, known = 0.0;
+    for (int r = highest; r >= lowest; --r) {
+      std::size_t& end = last[r - lowest];
+      while (end < cells.row_first[r + 1] && cells.col[end] <= col + kFarthest) ++end;
+      double along = 0.0, known_along = 0.0;
+      for (std::size_t k = end; k > cells.row_first[r] && cells.col[k - 1] >= col - kFarthest; --k) {
+        const double by = weights[std::abs(cells.col[k - 1] - col)];
+        along += by * scatter.variance[k - 1];
+        known_along += by * scatter.known[k - 1];
+      }
+      variance += weights[std::abs(r - row)] * along;
+      known += weights[std::abs(r - row)] * known_along;
     }
-    return both;
+    deviation[c] = known > 0.0 ? std::sqrt(variance / known) : 0.0;
+  }
+}
+
+/// The number of points in the patch of each point: a cell is kPatches x kPatches of them.
+std::vector<int> crowding(const double* xy, const OccupiedCells& cells) {
+  const CellGrid& grid = cells.grid;
+  const auto within = [&grid](double from_corner) {
+    const double at = from_corner / grid.side;
+    return static_cast<int>(kPatches * (at - std::floor(at)));
   };
-  return smooth(variance * known) / smooth(known).max(1e-300);
+  std::vector<int> crowd(cells.col.size() * kPatches * kPatches, 0), patch(cells.indices.size());
+  for (std::size_t i = 0; i < patch.size(); ++i) {
+    patch[i] = within(xy[2 * i + 1] - grid.y) * kPatches + within(xy[2 * i] - grid.x);
+    ++crowd[cells.of_point[i] * kPatches * kPatches + patch[i]];
+  }
+  for (std::size_t i = 0; i < patch.size(); ++i)
+    patch[i] = crowd[cells.of_point[i] * kPatches * kPatches + patch[i]];
+  return patch;
 }
 
 }  // namespace
 
-void noise_ratio(const double* xy, const double* elevation, std::size_t count, double cell, double* ratio,
-                 int threads) {
-  if (!(cell > 0.0) || count == 0)
-    throw std::invalid_argument("there must be points and a positive cell size");
-  const CellGrid grid = cells_over(xy, count, cell);
-  const SortedCells cells = sort_into_cells(xy, count, grid);
-  Eigen::ArrayXXd variance = Eigen::ArrayXXd::Zero(grid.cols, grid.rows), known = variance;
-  std::vector<double> residuals(count, 0.0);
-  Workers workers(threads);
-  workers.run(grid.rows, [&](int row) {
-    for (int col = 0; col < grid.cols; ++col) {
-      const std::size_t c = static_cast<std::size_t>(row) * grid.cols + col;
-      if (cells.first[c + 1] - cells.first[c] < kFewest) continue;
-      const double deviation = scatter(xy, elevation, &cells.indices[cells.first[c]],
-                                       &cells.indices[0] + cells.first[c + 1], cell, residuals.data());
-      variance(col, row) = deviation * deviation;
-      known(col, row) = 1.0;
-    }
-  });
-  const Eigen::ArrayXXd deviation = pool(variance, known).sqrt();
+void noise_ratio(const double* xy, const double* elevation, std::size_t count, double cell,
+                 double smallest_scatter, double* ratio, int threads) {
+  if (!positive(cell)) throw std::invalid_argument("the cell size must be positive");
+  if (!(smallest_scatter >= 0.0)) throw std::invalid_argument("the smallest scatter must not be negative");
+  check_threads(threads);
+  check_positions(xy, elevation, count);
+  const OccupiedCells cells = occupied_cells(xy, count, cell);
+  ThreadPool workers(threads);
+  const Scatter scatter = measure_scatter(xy, elevation, cells, workers);
+  std::vector<double> deviation(cells.col.size());
+  workers.run(cells.grid.rows, [&](int row) { pool_row(cells, row, scatter, deviation); });
+  const std::vector<int> crowd = crowding(xy, cells);
+  for (std::size_t i = 0; i < count; ++i) ratio[i] = std::sqrt(crowd[i]);
   std::vector<double> told;
   for (std::size_t i = 0; i < count; ++i)
-    if (known(cells.of_point[i]) > 0.0) told.push_back(deviation(cells.of_point[i]));
-  const SortedCells patches = sort_into_cells(xy, count, cells_over(xy, count, cell / kPatches));
-  for (std::size_t i = 0; i < count; ++i)
-    ratio[i] = std::sqrt(patches.first[patches.of_point[i] + 1] - patches.first[patches.of_point[i]]);
+    if (scatter.known[cells.of_point[i]] > 0.0) told.push_back(deviation[cells.of_point[i]]);
   if (told.size() < kEnough * count) return;
-  const double typical = median(told);
+  const double typical = std::max(median(told), smallest_scatter);
   if (!(typical > 0.0)) return;
   for (std::size_t i = 0; i < count; ++i) {
-    const double here = deviation(cells.of_point[i]);
+    const double here = deviation[cells.of_point[i]];
     if (here <= 0.0) continue;
     const double smallest = std::max(here, kSmallest * typical);
-    const double excess = std::max(1.0, std::abs(residuals[i]) / (kOutlier * smallest));
-    ratio[i] *= smallest / typical * excess * excess;
+    const double excess = std::max(1.0, std::abs(scatter.residuals[i]) / (kOutlier * smallest));
+    ratio[i] *= std::min(smallest / typical * excess * excess, kLargest);
   }
 }
 

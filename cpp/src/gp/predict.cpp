@@ -6,6 +6,8 @@
 #include <string>
 #include <tuple>
 
+#include "cells.hpp"
+#include "checks.hpp"
 #include "evaluate.hpp"
 #include "solve.hpp"
 #include "terrainloop/gp.hpp"
@@ -14,9 +16,10 @@ namespace terrainloop::gp {
 namespace {
 
 constexpr int kReach = 14;  // cells (7 length scales) from the nearest point to where only the prior is left
-constexpr int kWindow = 320;         // cells along an axis that are solved at once, which bounds memory ...
-constexpr int kHalo = 24;            // ... and cells around them, so that the solutions agree at the seams
-constexpr int kMargins[] = {4, 7};   // knots by which subdomains overlap, and where that does not converge
+constexpr int kWindow = 320;        // cells along an axis that are solved at once, which bounds memory ...
+constexpr int kHalo = 24;           // ... and cells around them, so that the solutions agree at the seams
+constexpr int kMargins[] = {4, 7};  // knots by which subdomains overlap, and where that does not converge
+constexpr double kMostArea = 1e8;  // cells, which are visited window by window even where there are no points
 constexpr double kRounding = 1e-12;  // smallest variance, as a share of the prior's
 
 struct Box {
@@ -28,17 +31,13 @@ struct Box {
 };
 
 void check(const Points& points, const Hyperparameters& parameters, int threads) {
-  const auto positive = [](double value) { return value > 0.0 && std::isfinite(value); };
-  if (!positive(parameters.length_scale) || !positive(parameters.variance))
+  const double length_scale = parameters.length_scale, variance = parameters.variance;
+  if (!positive(length_scale) || !positive(variance))
     throw std::invalid_argument("length_scale and variance must be positive");
-  if (points.count == 0) throw std::invalid_argument("there must be at least one point");
-  if (threads < 1) throw std::invalid_argument("threads must be >= 1");
-  for (std::size_t i = 0; i < points.count; ++i) {
-    if (!std::isfinite(points.xy[2 * i]) || !std::isfinite(points.xy[2 * i + 1]) ||
-        !std::isfinite(points.elevation[i]))
-      throw std::invalid_argument("points must be finite");
-    if (!positive(points.noise[i])) throw std::invalid_argument("noise must be positive");
-  }
+  if (!positive(length_scale * length_scale) || !positive(variance / (length_scale * length_scale)))
+    throw std::invalid_argument("the variance of the slope must be a positive number");
+  check_threads(threads);
+  check_points(points);
 }
 
 /// Cells over the ground that is asked for, as far as the points reach.
@@ -53,10 +52,13 @@ Lattice cover(const Points& points, const Box queries[2], double spacing) {
     origin[axis] = std::min(ground[axis].low, std::max(queries[axis].low, ground[axis].low - reach));
     const double end = std::max(ground[axis].high, std::min(queries[axis].high, ground[axis].high + reach));
     const double count = std::max(1.0, std::ceil((end - origin[axis]) / spacing));
-    if (count > 1e6) throw std::invalid_argument("the extent must be below a million length scales");
+    if (!(count <= kMostCells))
+      throw std::invalid_argument("the extent must be below half a million length scales");
     cells[axis] = static_cast<int>(count);
     origin[axis] -= 0.5 * (count * spacing - (end - origin[axis]));
   }
+  if (static_cast<double>(cells[0]) * cells[1] > kMostArea)
+    throw std::invalid_argument("the area must be below 25 million squares of a length scale");
   return {origin[0], origin[1], spacing, cells[1], cells[0]};
 }
 
@@ -86,7 +88,7 @@ using Places = std::function<void(const CellRange&, const Visit&)>;
 /// Posterior of one window of a lattice.
 class WindowSolver {
  public:
-  WindowSolver(const BinnedPoints& binned, const Lattice& lattice, double variance, Workers& workers)
+  WindowSolver(const BinnedPoints& binned, const Lattice& lattice, double variance, ThreadPool& workers)
       : lattice_(lattice),
         covariance_(weight_covariance(std::max(lattice.knot_rows(), lattice.knot_cols()))),
         precision_{inverse(toeplitz(covariance_, lattice.knot_rows())),
@@ -137,7 +139,7 @@ class WindowSolver {
   std::vector<double> covariance_;
   Precision precision_;
   Information information_;
-  Workers& workers_;
+  ThreadPool& workers_;
 };
 
 /// Solves window after window; `places_of` gives the places in one, `count` is that of all places.
@@ -153,7 +155,7 @@ void predict(const Points& points, const Hyperparameters& parameters, const Box 
   fill(maps.gradient_variance, prior_slope);
   const double spacing = kKnotSpacing * parameters.length_scale;
   const Lattice whole = cover(points, queries, spacing);
-  Workers workers(threads);
+  ThreadPool workers(threads);
   for (const Window& row : windows(whole.rows))
     for (const Window& col : windows(whole.cols)) {
       const Lattice lattice{whole.x + col.low * spacing, whole.y + row.low * spacing, spacing,
@@ -221,6 +223,8 @@ void predict_grid(const Points& points, const Hyperparameters& parameters, const
 void predict_at(const Points& points, const Hyperparameters& parameters, const double* queries,
                 std::size_t count, const Maps& maps, int threads) {
   check(points, parameters, threads);
+  if (count > static_cast<std::size_t>(std::numeric_limits<int>::max()))
+    throw std::invalid_argument("there must be fewer than 2^31 queries");
   if (count == 0) return;
   Box box[2];
   for (std::size_t i = 0; i < 2 * count; ++i) {

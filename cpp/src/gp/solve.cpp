@@ -1,5 +1,6 @@
 #include "solve.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <stdexcept>
 
@@ -9,6 +10,7 @@ namespace {
 constexpr int kMaxSteps = 40;
 constexpr double kTolerance =
     5e-4;  // a correction, as a share of the solution; the error left is far smaller
+constexpr double kNegligible = 1e-7;  // a correction, as a share of the prior's deviation
 
 /// Size of what the weights say about the slopes.
 double roughness(const RowMatrix& w) {
@@ -17,7 +19,7 @@ double roughness(const RowMatrix& w) {
 }
 
 RowMatrix precondition(const std::vector<Subdomain>& subdomains, const RowMatrix& residual,
-                       Workers& workers) {
+                       ThreadPool& workers) {
   std::vector<RowMatrix> parts(subdomains.size());
   workers.run(static_cast<int>(parts.size()), [&](int i) { parts[i] = subdomains[i].solve(residual); });
   RowMatrix sum = RowMatrix::Zero(residual.rows(), residual.cols());
@@ -28,7 +30,7 @@ RowMatrix precondition(const std::vector<Subdomain>& subdomains, const RowMatrix
 }
 
 RowMatrix product(const Information& information, const Precision& precision, const RowMatrix& w,
-                  Workers& workers) {
+                  ThreadPool& workers) {
   RowMatrix out = precision.rows * w * precision.cols / precision.variance;
   information.add_product(w, out, workers);
   return out;
@@ -39,15 +41,17 @@ double dot(const RowMatrix& a, const RowMatrix& b) { return a.cwiseProduct(b).su
 }  // namespace
 
 RowMatrix solve_weights(const Information& information, const Precision& precision,
-                        const std::vector<Subdomain>& subdomains, Workers& workers) {
+                        const std::vector<Subdomain>& subdomains, ThreadPool& workers) {
   RowMatrix residual = information.vector();
   RowMatrix w = RowMatrix::Zero(residual.rows(), residual.cols());
   if (residual.isZero(0.0)) return w;
+  // Where the ground is flat to rounding there is no solution to compare a correction with.
+  const double negligible = kNegligible * std::sqrt(precision.variance * static_cast<double>(w.size()));
   std::vector<RowMatrix> steps, products;
   for (int k = 0; k < kMaxSteps; ++k) {
     RowMatrix step = precondition(subdomains, residual, workers);
     const double correction = roughness(step), whole = roughness(w + step);
-    if (correction <= kTolerance * whole) return w + step;
+    if (correction <= std::max(kTolerance * whole, negligible)) return w + step;
     for (std::size_t i = 0; i < steps.size(); ++i) step -= dot(step, products[i]) * steps[i];
     RowMatrix image = product(information, precision, step, workers);
     const double energy = dot(step, image);

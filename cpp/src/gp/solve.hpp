@@ -19,6 +19,6 @@ struct Precision {
 /// Throws std::runtime_error unless the correction that the preconditioner makes of the last residual is
 /// below the tolerance.
 RowMatrix solve_weights(const Information& information, const Precision& precision,
-                        const std::vector<Subdomain>& subdomains, Workers& workers);
+                        const std::vector<Subdomain>& subdomains, ThreadPool& workers);
 
 }  // namespace terrainloop::gp

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <utility>
 
 #include "cells.hpp"
@@ -12,7 +13,7 @@ namespace {
 /// Calls body(row) for every row, those that lie closer than a B-spline's support never at once: what they
 /// add to shared places is summed in the same order whatever the number of threads.
 template <typename Body>
-void striped(Workers& workers, int rows, const Body& body) {
+void striped(ThreadPool& workers, int rows, const Body& body) {
   for (int stripe = 0; stripe < std::min(kSupport, rows); ++stripe)
     workers.run((rows - stripe + kSupport - 1) / kSupport, [&](int i) { body(stripe + kSupport * i); });
 }
@@ -71,14 +72,15 @@ BinnedPoints bin(const Points& points, const Lattice& lattice) {
   binned.points.reserve(cells.indices.size());
   for (const std::size_t i : cells.indices) {
     const int row = cells.of_point[i] / lattice.cols, col = cells.of_point[i] % lattice.cols;
+    const double noise = points.noise[i];
     binned.points.push_back({(points.xy[2 * i] - lattice.x) / lattice.spacing - col,
                              (points.xy[2 * i + 1] - lattice.y) / lattice.spacing - row, points.elevation[i],
-                             1.0 / (points.noise[i] * points.noise[i])});
+                             1.0 / std::max(noise * noise, std::numeric_limits<double>::min())});
   }
   return binned;
 }
 
-Information::Information(const BinnedPoints& binned, const Lattice& lattice, Workers& workers)
+Information::Information(const BinnedPoints& binned, const Lattice& lattice, ThreadPool& workers)
     : cols_(lattice.knot_cols()),
       matrix_(static_cast<std::size_t>(lattice.knot_rows()) * kSupport * kSupport * cols_, 0.0),
       vector_(RowMatrix::Zero(lattice.knot_rows(), cols_)) {
@@ -119,7 +121,7 @@ void Information::add_cell(int row, int col, const CellPoint* begin, const CellP
               &matrix_[index(row + kPairList[pair].first, kPairList[pair].offset, 0) + col], cols_);
 }
 
-void Information::add_product(const RowMatrix& w, RowMatrix& out, Workers& workers) const {
+void Information::add_product(const RowMatrix& w, RowMatrix& out, ThreadPool& workers) const {
   const int rows = static_cast<int>(w.rows());
   using Row = Eigen::Map<const Eigen::ArrayXd>;
   striped(workers, rows, [&](int row) {

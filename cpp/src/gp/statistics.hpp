@@ -7,7 +7,7 @@
 #include "bspline.hpp"
 #include "prior.hpp"
 #include "terrainloop/gp.hpp"
-#include "workers.hpp"
+#include "thread_pool.hpp"
 
 /// What the points say about the weights of the spline.
 namespace terrainloop::gp {
@@ -37,7 +37,7 @@ struct BinnedPoints {
   std::vector<std::size_t> first;  ///< of each cell, and one past the last
 };
 
-/// The points that lie on the lattice, closed at its upper borders where `closed` says so.
+/// The points on the lattice, which is closed at its upper borders.
 BinnedPoints bin(const Points& points, const Lattice& lattice);
 
 /// Information matrix Phi' W Phi and vector Phi' W z of the weights.
@@ -46,7 +46,7 @@ BinnedPoints bin(const Points& points, const Lattice& lattice);
 /// knots (i, j) and (i', j') stands once, at (min(i, i'), min(j, j')) and the offsets |i - i'|, |j - j'|.
 class Information {
  public:
-  Information(const BinnedPoints& binned, const Lattice& lattice, Workers& workers);
+  Information(const BinnedPoints& binned, const Lattice& lattice, ThreadPool& workers);
 
   /// Entries of the pairs that begin at the knots of a row and have these offsets, by column.
   const double* at(int row, int row_offset, int col_offset) const {
@@ -55,7 +55,7 @@ class Information {
   /// Phi' W z, (knot rows, knot cols).
   const RowMatrix& vector() const { return vector_; }
   /// out += Phi' W Phi w.
-  void add_product(const RowMatrix& w, RowMatrix& out, Workers& workers) const;
+  void add_product(const RowMatrix& w, RowMatrix& out, ThreadPool& workers) const;
 
  private:
   std::size_t index(int row, int row_offset, int col_offset) const {

@@ -22,9 +22,9 @@ struct Interval {
 
 /// Cuts an axis of `cells` cells into intervals whose knots reach `margin` knots beyond their cells.
 ///
-/// `covariance` and `precision` are the prior of the whole axis. Knots beyond an interval are held at zero
-/// by its rows of `precision` alone; most of the way the interval takes the inverse of its own covariance
-/// instead, which leaves them free: that halves the error of its variance.
+/// `covariance` and `precision` are the prior of the whole axis. The precision used is 0.9 times the inverse
+/// of the interval's own covariance, which leaves the knots outside free, plus 0.1 times the rows of
+/// `precision`, which clamp them to zero: free knots halve the error of the variance.
 std::vector<Interval> cut(int cells, int margin, const std::vector<double>& covariance,
                           const Matrix& precision);
 

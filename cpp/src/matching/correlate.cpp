@@ -1,12 +1,15 @@
 #include <algorithm>
+#include <cmath>
 #include <limits>
+#include <stdexcept>
 
 #include "fft.hpp"
-#include "terrainloop/search.hpp"
+#include "search.hpp"
 
 namespace terrainloop::search {
 namespace {
 
+constexpr int kLargest = 8192;      // memory grows with its square, to 8 GB
 constexpr float kRounding = 1e-6f;  // of the FFT, relative to the largest value
 
 Complex lanes_at(const float* spectrum, int wave) {
@@ -149,9 +152,16 @@ class Block {
   Lanes count_, sum_;
 };
 
+void check_size(int size) {
+  if (size < 1 || size > kLargest) throw std::invalid_argument("size must be within 1..8192");
+}
+
 }  // namespace
 
 std::vector<float> conjugate_spectra(const float* images, int blocks, int extent, int size) {
+  check_size(size);
+  if (blocks < 0 || extent < 0 || extent > size)
+    throw std::invalid_argument("blocks and extent must not be negative, nor extent larger than size");
   const std::size_t pixels = static_cast<std::size_t>(extent) * extent, pair = 2 * pixels;
   const std::size_t waves = static_cast<std::size_t>(size) * (size / 2 + 1);
   std::vector<float> spectra(static_cast<std::size_t>(blocks) * 2 * waves * 2 * kLanes);
@@ -179,7 +189,11 @@ std::vector<float> conjugate_spectra(const float* images, int blocks, int extent
 
 Correlations correlate(const TurnedSpectra& source, const StoredSpectra& stored, int size,
                        double least_shared, double evident) {
+  check_size(size);
   if (size % 4 != 0) throw std::invalid_argument("size must be a multiple of 4");
+  if (source.blocks < 0) throw std::invalid_argument("blocks must not be negative");
+  if (!(least_shared >= 0.0) || !(evident >= 0.0))
+    throw std::invalid_argument("least_shared and evident must not be negative");
   const std::size_t rotations = static_cast<std::size_t>(source.blocks) * kLanes;
   Correlations found{{}, std::vector<double>(rotations), std::vector<double>(rotations)};
   Block work(source, stored, size, least_shared);

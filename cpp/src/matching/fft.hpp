@@ -7,7 +7,7 @@
 #include <utility>
 #include <vector>
 
-#include "terrainloop/search.hpp"
+#include "search.hpp"
 
 namespace terrainloop::search {
 
@@ -42,6 +42,7 @@ inline Complex operator*(const Phase& w, const Complex& a) {
 class InverseFft {
  public:
   explicit InverseFft(int n) : n_(n) {
+    if (n < 1) throw std::invalid_argument("size must be positive");
     for (const int radix : {4, 2, 3, 5})
       for (; n % radix == 0; n /= radix) add_pass(radix, n);
     if (n != 1) throw std::invalid_argument("size must have no factors but 2, 3 and 5");

@@ -2,8 +2,10 @@
 
 #include <algorithm>
 #include <cmath>
+#include <stdexcept>
 #include <utility>
 
+#include "../image_checks.hpp"
 #include "interpolate.hpp"
 
 namespace terrainloop {
@@ -46,7 +48,15 @@ std::pair<float, float> cubic(const ImageView<float>& x, const ImageView<float>&
 
 void turn_field(const ImageView<float>& x, const ImageView<float>& y, const ImageView<float>& known,
                 const Lookup& lookup, int rows, int cols, float* out) {
+  check(x, "x");
+  check(y, "y");
+  check(known, "known");
+  if (!same_shape(x, y) || !same_shape(x, known))
+    throw std::invalid_argument("x, y and known must have one shape");
+  if (rows < 0 || cols < 0) throw std::invalid_argument("rows and cols must not be negative");
   const double scale = std::hypot(lookup[0], lookup[1]);
+  if (!(scale > 0.0) || !std::all_of(lookup.begin(), lookup.end(), [](double v) { return std::isfinite(v); }))
+    throw std::invalid_argument("the lookup must be finite and must not collapse the image");
   const float c = static_cast<float>(lookup[0] / scale), s = static_cast<float>(lookup[1] / scale);
   const std::size_t pixels = static_cast<std::size_t>(rows) * cols;
   for (int row = 0; row < rows; ++row)

@@ -3,14 +3,16 @@
 #include <Eigen/Dense>
 #include <algorithm>
 #include <cmath>
+#include <stdexcept>
 
+#include "../image_checks.hpp"
 #include "interpolate.hpp"
 
 namespace terrainloop::refine {
 namespace {
 
 constexpr double kCauchy = 2.5;      // robust standard deviations at which a residual counts half
-constexpr std::size_t kFewest = 50;  // places
+constexpr std::size_t kFewest = 50;  // samples
 constexpr double kNormal = 1.4826;   // standard deviations in a median absolute deviation
 constexpr float kWhole = 0.999f;     // of known ground
 
@@ -41,12 +43,13 @@ class Aligned {
     std::vector<char> known(static_cast<std::size_t>(rows) * cols);
     for (int row = 0; row < rows; ++row)
       for (int col = 0; col < cols; ++col)
-        known[row * cols + col] = of_target(target_.mask, {row, col}) != 0 &&
-                                  bilinear(source_.mask, Place(lookup_, col, row)) > kWhole;
+        known[static_cast<std::size_t>(row) * cols + col] =
+            of_target(target_.mask, {row, col}) != 0 &&
+            bilinear(source_.mask, Place(lookup_, col, row)) > kWhole;
     std::vector<Pixel> pixels;
     for (int row = 1; row + 1 < rows; ++row)
       for (int col = 1; col + 1 < cols; ++col) {
-        const char* at = &known[row * cols + col];
+        const char* at = &known[static_cast<std::size_t>(row) * cols + col];
         bool all = true;
         for (const int down : {-cols, 0, cols}) all = all && at[down - 1] && at[down] && at[down + 1];
         if (all) pixels.push_back({row, col});
@@ -134,9 +137,11 @@ std::optional<Linearised> linearise(const Gradients& source, const Gradients& ta
     const Vector by_y = (aligned.of_source({p.row + 1, p.col}) - aligned.of_source({p.row - 1, p.col})) /
                         (2 * aligned.spacing());
     const double u = at.ground[2 * i] - at.pivot_x, v = at.ground[2 * i + 1] - at.pivot_y;
-    // A motion carries the field along: it falls by its slope along the way, and turns.
+    // d r / d t = grad g . t; d r / d theta: displacement about the pivot, less the rotation of g itself.
     const Vector by_turn = by_y * u - by_x * v - Vector(-g.y(), g.x());
     variance[i] = aligned.variance(p);
+    if (!(variance[i] > 0.0 && std::isfinite(variance[i]) && residual.allFinite()))
+      throw std::invalid_argument("masked gradients must be finite, their variances positive");
     for (int k = 0; k < 2; ++k) {
       const std::size_t row = k * count + i;
       at.residual[row] = residual[k];
@@ -173,10 +178,27 @@ std::pair<Motion, double> step(const Linearised& at) {
           std::hypot(by[0], by[1]) + std::abs(by[2]) * radius};
 }
 
+void check(const Gradients& map) {
+  terrainloop::check(map.x, "x");
+  terrainloop::check(map.mask, "mask");
+  if (!same_shape(map.x, map.y) || !same_shape(map.x, map.variance) || !same_shape(map.x, map.mask))
+    throw std::invalid_argument("gradients, variance and mask must have one shape");
+  if (!std::isfinite(map.origin_x) || !std::isfinite(map.origin_y) || !std::isfinite(map.resolution) ||
+      !(map.resolution > 0.0))
+    throw std::invalid_argument("a map must have a finite origin and a positive resolution");
+}
+
 }  // namespace
 
 std::optional<Linearised> settle(const Gradients& source, const Gradients& target, const Motion& motion,
                                  const Settings& settings) {
+  check(source);
+  check(target);
+  if (settings.step < 1 || settings.places < 1 || settings.steps < 0)
+    throw std::invalid_argument("step and places must be at least 1, steps 0");
+  if (!std::isfinite(motion.c) || !std::isfinite(motion.s) || !std::isfinite(motion.x) ||
+      !std::isfinite(motion.y))
+    throw std::invalid_argument("the motion must be finite");
   std::optional<Linearised> at = linearise(source, target, motion, settings);
   for (int i = 0; at && i < settings.steps; ++i) {
     const auto [further, moved] = step(*at);

@@ -1,4 +1,4 @@
-"""The C++ core: the one built for this machine or, in a wheel for all, the one for its level of x86-64."""
+"""The C++ core: the variant for this machine's level of x86-64, or the single one that was built."""
 
 from importlib import import_module
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 _Array = NDArray[np.float64]
 
 VARIANT: str
-"""Which build of the core this is: native, portable, x86-64-v2, x86-64-v3 or x86-64-v4."""
+"""Which build of the core this is: native, portable, x86-64-v2 or x86-64-v3."""
 
 LEVEL: int
 """Level of x86-64 that its compiler made use of; 0 for less than 2, or another architecture."""
@@ -65,7 +65,12 @@ def gp_predict_at(
     """As `gp_predict_grid`, at queries (Q, 2)."""
 
 def gp_noise_ratio(
-    xy: NDArray[np.float64], elevation: NDArray[np.float64], *, cell: float, threads: int = 1
+    xy: NDArray[np.float64],
+    elevation: NDArray[np.float64],
+    *,
+    cell: float,
+    smallest_scatter: float = 0.0,
+    threads: int = 1,
 ) -> NDArray[np.float64]:
     """Noise of each point as a share of the typical one, (N, 1), from the scatter in cells of this side."""
 

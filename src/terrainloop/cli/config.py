@@ -5,6 +5,8 @@ from rich.console import Console
 
 from terrainloop.cli.terminal import Json, PresetOption, Quiet, Terminal, Verbose, read_settings
 
+HELP = "Print the settings as YAML, to be edited and passed on with --config."
+
 
 def command(
     preset: PresetOption = "default",
@@ -12,7 +14,7 @@ def command(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Print the settings as YAML, to be edited and passed on with --config."""
+    """Run ``terrainloop config``."""
     settings = read_settings(preset, None, None)
 
     def show(console: Console) -> None:

@@ -1,5 +1,6 @@
 """``terrainloop demo``: simulate a mission, detect its loops, compare them with the ground truth."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,13 +15,20 @@ from terrainloop.cli.terminal import (
     Terminal,
     Verbose,
     WorkersOption,
+    check_folder,
     worker_count,
 )
+from terrainloop.errors import printable
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from terrainloop.detection.run import Run
     from terrainloop.io.missions import Mission
     from terrainloop.loop import LoopCandidate
+
+
+HELP = "Simulate a rover mission, find its loop closures, print the table, draw the pictures."
 
 
 def command(
@@ -36,17 +44,21 @@ def command(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Simulate a rover mission, find its loop closures, print the table, draw the pictures."""
+    """Run ``terrainloop demo``."""
     from terrainloop.config import Settings
     from terrainloop.detection.mission import detect_mission
-    from terrainloop.evaluation.judge import judge
+    from terrainloop.evaluation.pairs import evaluate_pairs
+    from terrainloop.evaluation.truth import MIN_OVERLAP, GroundTruth
     from terrainloop.io.missions import load_mission
-    from terrainloop.simulation.missions import simulate_mission, write_mission
+    from terrainloop.report import INSTALL_FIGURES, can_draw
+    from terrainloop.simulation.missions import simulate_mission, write_mission, written_before
 
     terminal = Terminal.open(as_json, quiet, verbose)
     settings = Settings().with_max_false_loops(max_false_loops)
     folder = output / "mission"
-    folder.mkdir(parents=True, exist_ok=True)
+    check_folder(folder)
+    written_before(folder)  # refuses before the work
+    number = worker_count(workers)
     with terminal.progress() as progress:
         simulated = simulate_mission(
             world, seed, submaps, progress=lambda done, total: progress("simulated", done, total)
@@ -54,43 +66,46 @@ def command(
     write_mission(simulated, folder)
     mission = load_mission(folder)
     with terminal.progress() as progress:
-        run = detect_mission(
-            mission, settings, output=output, workers=worker_count(workers), on_progress=progress
-        )
+        run = detect_mission(mission, settings, output=output, workers=number, on_progress=progress)
     candidates = list(run.pairs())
-    pairs = judge(candidates, run.submaps, simulated.truth)
-    pictures = _draw(output, mission, run, max(candidates, key=lambda candidate: candidate.score))
+    pairs = evaluate_pairs(candidates, GroundTruth(run.submaps, simulated.truth))
+    pictures: list[str] = []
     summary = detect.summarise(run) | {
         "false_loops": sum(not pair.pose_is_right for pair in pairs if pair.candidate),
-        "true_pairs": sum(pair.overlap > 0.3 for pair in pairs),
-        "true_pairs_found": sum(pair.overlap > 0.3 for pair in pairs if pair.candidate),
-        "pictures": [str(picture) for picture in pictures],
+        "true_pairs": sum(pair.overlap > MIN_OVERLAP for pair in pairs),
+        "true_pairs_found": sum(pair.overlap > MIN_OVERLAP for pair in pairs if pair.candidate),
+        "pictures": pictures,
     }
 
     def show(console: Console) -> None:
         detect.show(console, run)
         console.print(
             f"Against the ground truth: {summary['true_pairs_found']} of {summary['true_pairs']} pairs that "
-            f"share over 30 % of their ground found, {summary['false_loops']} false loops."
+            f"share over {MIN_OVERLAP:.0%} of their ground found, {summary['false_loops']} false loops."
         )
-        console.print("Pictures: " + ", ".join(summary["pictures"]), markup=False)
+        without = "none" if can_draw() else f"none; matplotlib is missing: {INSTALL_FIGURES}"
+        console.print("Pictures: " + (printable(", ".join(pictures)) or without))
 
-    terminal.result(summary, show)
+    try:
+        if run.complete and can_draw():
+            from terrainloop.report.figures import save_figure
+
+            best = max(candidates, key=lambda candidate: candidate.score)
+            for picture, figure in _figures(mission, run, best):
+                save_figure(figure, output / picture)
+                pictures.append(str(output / picture))
+    finally:  # the results are there, whatever becomes of their pictures
+        terminal.result(summary, show)
 
 
-def _draw(output: Path, mission: "Mission", run: "Run", best: "LoopCandidate") -> list[Path]:
+def _figures(mission: "Mission", run: "Run", best: "LoopCandidate") -> Iterator[tuple[str, "Figure"]]:
     """The mission with its loops, one gradient map, and the surest match."""
-    from terrainloop.report.figures import figure_map, figure_match, figure_mission, save_figure
+    from terrainloop.report.figures import figure_map, figure_match, figure_mission
 
     assert mission.truth is not None
     source, target = run.entries[best.source], run.entries[best.target]
     hulls = [record.hull for record in run.submaps]
     title = f"{len(run.loops)} loop closures, submaps at their true poses"
-    figures = {
-        "mission.png": figure_mission(mission.names, mission.truth.poses, hulls, run.loops, title=title),
-        "map.png": figure_map(mission.read(mission.names.index(best.source)), source.gradient_map),
-        "match.png": figure_match(source, target, best, run.settings),
-    }
-    for name, figure in figures.items():
-        save_figure(figure, output / name)
-    return [output / name for name in figures]
+    yield "mission.png", figure_mission(mission.names, mission.truth.poses, hulls, run.loops, title=title)
+    yield "map.png", figure_map(mission.read(mission.names.index(best.source)), source.gradient_map)
+    yield "match.png", figure_match(source, target, best, run.settings)

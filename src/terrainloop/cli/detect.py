@@ -17,15 +17,23 @@ from terrainloop.cli.terminal import (
     Terminal,
     Verbose,
     WorkersOption,
+    check_folder,
     count_of,
     read_settings,
     table_of,
     worker_count,
 )
+from terrainloop.errors import printable
 
 if TYPE_CHECKING:
     from terrainloop.detection.run import Run
     from terrainloop.loop import LoopCandidate
+
+
+HELP = """Find the loop closures among the submaps of a mission.
+
+Writes loops.csv (accepted), pairs.csv (every pair compared, with the reason), submaps.csv (every
+cloud, with repairs and errors), run.json (what was fitted) and config.yaml (the settings as run)."""
 
 
 def command(
@@ -43,14 +51,11 @@ def command(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Find the loop closures among the submaps of a mission.
-
-    Writes loops.csv (accepted), pairs.csv (every pair compared, with the reason), submaps.csv (every
-    cloud, with repairs and errors), run.json (what was fitted) and config.yaml (the settings as run).
-    """
+    """Run ``terrainloop detect``."""
     from terrainloop.detection.mission import detect_mission
 
     terminal = Terminal.open(as_json, quiet, verbose)
+    check_folder(output)
     settings = read_settings(preset, config, seed, max_false_loops)
     if all_pairs:
         settings = settings.model_copy(update={"skip_recent": 0})
@@ -93,11 +98,15 @@ def show(console: Console, run: "Run") -> None:
     )
     if run.loops:
         console.print("The transform takes points of source into the frame of target; yaw in degrees.")
-    if run.num_pairs == 0:
+    if len(usable) < 2:
+        console.print("No pair was compared: a loop closure needs two submaps.")
+    elif run.num_pairs == 0 and run.complete:
         console.print(
-            f"No pair was compared: the {count_of(run.settings.skip_recent, 'submap')} just before each is "
+            f"No pair was compared: the {count_of(run.settings.skip_recent, 'submap')} just before each are "
             "skipped. Use --all-pairs to compare them too, or 'terrainloop match A B' for two clouds."
         )
+    if not run.complete:
+        console.print("Incomplete: interrupted before every pair was compared.")
     if run.parameters is not None:
         p = run.parameters
         console.print(
@@ -105,17 +114,16 @@ def show(console: Console, run: "Run") -> None:
             f"noise {p.noise:.2g} m."
         )
     for kind, count in run.rejections.items():
-        console.print(f"  {count_of(count, 'pair')} rejected: {kind}", markup=False)
+        console.print(f"  {count_of(count, 'pair')} rejected: {kind}")
     for record in run.submaps:
         if record.status == "broken":
-            console.print(f"  left out {record.name}: {record.notes}", markup=False)
+            console.print(f"  left out {printable(f'{record.name}: {record.notes}')}")
     repaired = sum(bool(record.notes) for record in usable)
     if repaired:
         console.print(f"  {count_of(repaired, 'submap')} repaired on the way in: see notes in submaps.csv")
     console.print(
-        f"Written to {run.folder}: loops.csv, pairs.csv (why each was rejected), submaps.csv, config.yaml, "
-        "run.json",
-        markup=False,
+        f"Written to {printable(str(run.folder))}: loops.csv, pairs.csv (why each was rejected), "
+        "submaps.csv, config.yaml, run.json"
     )
 
 

@@ -1,265 +1,208 @@
-"""``terrainloop evaluate``: precision and recall against the truth."""
+"""``terrainloop evaluate``: a run against ground truth."""
 
-import csv
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 from rich.console import Console
 
 from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose, count_of, table_of
-from terrainloop.errors import TerrainLoopError
 
 if TYPE_CHECKING:
-    from terrainloop.config import MatchSettings
-    from terrainloop.evaluation.judge import JudgedPair, Reading
-    from terrainloop.evaluation.precision_recall import Metrics, OperatingPoint
-    from terrainloop.geometry import Array
-    from terrainloop.loop import LoopCandidate
-    from terrainloop.record import SubmapRecord
+    from terrainloop.evaluation.summary import Evaluation
 
-    Judged = JudgedPair[LoopCandidate]
+OVERLAPS = {"box": "bounding-box IoU", "observed": "IoU of the observed ground"}
+CRITERIA = ("pose", "overlap and pose", "overlap")
 
-INLIER_THRESHOLDS: Sequence[int] = tuple(range(1, 21))  # the paper's
-SCORE_THRESHOLDS: Sequence[int] = (0, 1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 50)
-_COUNTS = ("precision", "recall", "true_positives", "false_positives", "false_negatives")
-TRUTHS = {"box": "Bounding-box IoU", "observed": "IoU of the observed ground"}
+
+HELP = """Evaluate a run against ground-truth poses: loops, revisits, precision and recall.
+
+Writes precision_recall.csv, precision_recall_curve.csv and precision_recall.png into the folder of
+the run. Pairs of consecutive submaps are left out because odometry already connects them. Run
+detect with --all-pairs to score every other pair."""
 
 
 def command(
     run: Annotated[Path, typer.Argument(help="Output folder of 'terrainloop detect'.")],
-    truth: Annotated[Path, typer.Option("--truth", help="True poses, TUM or KITTI, one line a cloud.")],
+    truth: Annotated[Path, typer.Option("--truth", help="True poses, TUM or KITTI, one line per cloud.")],
     min_overlap: Annotated[
         float,
         typer.Option(
             "--min-overlap",
             min=0.0,
             max=1.0,
-            help="A true match has a larger bounding-box IoU than this (the paper: 0.3, Morocco 0.1).",
+            help="A pair is true if its bounding-box IoU exceeds this (the paper: 0.3, Morocco 0.1).",
         ),
     ] = 0.3,
+    position_tolerance: Annotated[
+        float | None,
+        typer.Option(
+            "--position-tolerance",
+            help="Horizontal error, in metres, below which a pose is right. "
+            "Default: 1 m, bounded by 2 % and 10 % of the size of the submaps.",
+        ),
+    ] = None,
+    yaw_tolerance: Annotated[
+        float,
+        typer.Option("--yaw-tolerance", help="Error of yaw, in degrees, below which a pose is right."),
+    ] = 5.0,
     sessions: Annotated[
         Path | None,
         typer.Option("--sessions", help="CSV 'cloud,session': leave out pairs of one session."),
     ] = None,
     clouds: Annotated[
         Path | None,
-        typer.Option("--clouds", help="Mission folder: judge by the ground that the clouds show, too."),
+        typer.Option("--clouds", help="Mission folder: use the overlap of the observed ground, too."),
     ] = None,
     as_json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Hold a run's pairs against true poses: precision and recall over the score or the inlier threshold.
-
-    Consecutive submaps are left out: odometry joins them anyway. Detect with --all-pairs to score
-    every other pair.
-    """
-    from terrainloop.config import Settings
-    from terrainloop.evaluation.judge import judge, readings
-    from terrainloop.evaluation.precision_recall import precision_recall
-    from terrainloop.io.missions import read_sessions
-    from terrainloop.io.results import read_loops, read_submaps
-    from terrainloop.io.trajectories import read_trajectory
+    """Run ``terrainloop evaluate``."""
+    from terrainloop.evaluation.summary import evaluate_run
+    from terrainloop.report import can_draw
 
     terminal = Terminal.open(as_json, quiet, verbose)
-    candidates, records = read_loops(run / "pairs.csv"), read_submaps(run / "submaps.csv")
-    poses = read_trajectory(truth).poses
-    pairs = judge(
-        candidates,
-        records,
-        poses,
-        read_sessions(sessions) if sessions else None,
-        _observed(clouds, records, poses) if clouds else None,
+    evaluation = evaluate_run(
+        run,
+        truth,
+        min_overlap=min_overlap,
+        position_tolerance=position_tolerance,
+        yaw_tolerance=math.radians(yaw_tolerance),
+        sessions=sessions,
+        clouds=clouds,
     )
-    name, thresholds, values = _scores(pairs, Settings.from_yaml(run / "config.yaml").match)
-    points = precision_recall(values, [pair.overlap > min_overlap for pair in pairs], thresholds)
-    by_pose = precision_recall(values, [pair.pose_is_right for pair in pairs], thresholds)
-    rows = [_row(name, point, posed.precision) for point, posed in zip(points, by_pose, strict=True)]
-    _write_rows(run / "precision_recall.csv", list(rows[0]), [list(row.values()) for row in rows])
-    read = {
-        (kind, right_by): reading
-        for kind in (TRUTHS if clouds else ["box"])
-        for right_by, reading in readings(pairs, min_overlap, kind == "observed", values).items()
-    }
-    _write_rows(
-        run / "precision_recall_curve.csv", ["truth", "right_by", f"min_{name}", *_COUNTS], _curve_rows(read)
+    evaluation.write(run)
+    if can_draw():
+        from terrainloop.report.figures import figure_precision_recall, save_figure
+
+        save_figure(figure_precision_recall(evaluation), run / "precision_recall.png")
+    terminal.result(evaluation.as_dict(), lambda console: show(console, evaluation))
+
+
+def show(console: Console, evaluation: "Evaluation") -> None:
+    """The result in sentences, then the tables and what they count."""
+    for sentence in _sentences(evaluation):
+        console.print(sentence)
+    if evaluation.pairs:
+        console.print()
+        _show_table(console, evaluation)
+        _show_metrics(console, evaluation)
+        _show_legend(console, evaluation)
+
+
+def _sentences(evaluation: "Evaluation") -> list[str]:
+    """The answer first: how many loops are right, what was found, how good the poses are."""
+    result, tolerance = evaluation.as_dict(), evaluation.tolerance
+    left_out = (
+        f"{count_of(result['pairs'], 'pair')} evaluated; {result['pairs_left_out']} left out: consecutive "
+        "submaps" + (" or one session." if evaluation.truth.sessions else ".")
     )
-    metrics = {key: reading.metrics() for key, reading in read.items()}
-    _draw(run / "precision_recall.png", points, read, metrics, f"true match: IoU > {min_overlap:g}", name)
-    summary = summarise(pairs, min_overlap) | {
-        "threshold": name,
-        "metrics": [
-            {"truth": kind, "right_by": right_by, **asdict(numbers)}
-            for (kind, right_by), numbers in metrics.items()
-        ],
-        "precision_recall": rows,
-    }
-    terminal.result(summary, lambda console: show(console, summary, metrics))
+    if not evaluation.pairs:
+        return [f"Nothing to evaluate: {left_out}"]
+    sentences = [
+        f"{count_of(result['accepted'], 'loop')} accepted: {result['accepted_right_pose']} right, "
+        f"{result['accepted_wrong_pose']} wrong by pose (within {tolerance.position:g} m and "
+        f"{math.degrees(tolerance.yaw):g} deg).",
+        *_retrieval_sentences(evaluation),
+    ]
+    if result["accepted"]:
+        sentences.append(
+            f"Within 2 m and 5 deg: {100 * result['share_within_2m_5deg']:.1f} % of the accepted loops; "
+            f"yaw within 10 deg: {100 * result['share_yaw_within_10deg']:.1f} %."
+        )
+    if result["accepted_right_pose"]:
+        sentences.append(
+            f"Median error of the right loops: {result['right_pose_median_position_error_m']:.3f} m, "
+            f"{result['right_pose_median_height_error_m']:.3f} m in height, "
+            f"{result['right_pose_median_yaw_error_deg']:.2f} deg of yaw."
+        )
+    return [*sentences, left_out]
 
 
-def summarise(pairs: Sequence["Judged"], min_overlap: float) -> dict[str, Any]:
-    """What the command reports beside the curve."""
-    from terrainloop.evaluation.precision_recall import recall_at_full_precision
-
-    accepted = [pair for pair in pairs if pair.candidate]
-    right = [pair for pair in accepted if pair.overlap > min_overlap]
-    disjoint = [pair.candidate.score for pair in pairs if pair.overlap == 0]
-    bands = {
-        f"{low:g}-{high:g}": [pair.candidate.score for pair in pairs if low < pair.overlap <= high]
-        for low, high in ((0.1, 0.3), (0.3, 1.0))
-    }
-    return {
-        "pairs": len(pairs),
-        "true_pairs": sum(pair.overlap > min_overlap for pair in pairs),
-        "disjoint_pairs": len(disjoint),
-        "min_overlap": min_overlap,
-        "accepted": len(accepted),
-        "accepted_true": len(right),
-        "accepted_less_overlap": sum(0 < pair.overlap <= min_overlap for pair in accepted),
-        "accepted_disjoint": sum(pair.overlap == 0 for pair in accepted),
-        "accepted_wrong_pose": sum(not pair.pose_is_right for pair in accepted),
-        "median_position_error_m": _median([pair.position_error for pair in right]),
-        "median_height_error_m": _median([pair.height_error for pair in right]),
-        "median_yaw_error_deg": float(np.degrees(_median([pair.yaw_error for pair in right]))),
-        "recall_before_first_disjoint": {
-            band: recall_at_full_precision(scores, disjoint) for band, scores in bands.items()
-        },
-        "pairs_by_overlap": {band: len(scores) for band, scores in bands.items()},
-    }
+def _retrieval_sentences(evaluation: "Evaluation") -> list[str]:
+    """What was found and closed, by bounding boxes and, where clouds were given, by the observed ground."""
+    box, *observed = evaluation.as_dict()["retrieval"]
+    at_one = _ratio(box["precision_at_one"], box["answered_right"], box["answered"])
+    return [
+        f"Found {box['true_pairs_found']} of {count_of(box['true_pairs'], 'pair')} that share over "
+        f"{100 * evaluation.min_overlap:g} % of their ground ({OVERLAPS['box']}).",
+        f"Closed {box['closed']} of {count_of(box['revisits'], 'revisit')} by at least one right loop.",
+        f"Best match per query: R@1 {_recall_at_one(box)}, P@1 {at_one}.",
+        *(
+            f"By {OVERLAPS['observed']}: found {row['true_pairs_found']} of {row['true_pairs']}, "
+            f"closed {row['closed']} of {row['revisits']}, R@1 {_recall_at_one(row)}."
+            for row in observed
+        ),
+    ]
 
 
-def show(console: Console, summary: dict[str, Any], metrics: Mapping[tuple[str, str], "Metrics"]) -> None:
-    """The summary, the curve and its numbers, as text."""
-    name = summary["threshold"]
+def _recall_at_one(row: dict[str, Any]) -> str:
+    return _ratio(row["recall_at_one"], row["right_at_one"], row["queries"])
+
+
+def _show_table(console: Console, evaluation: "Evaluation") -> None:
+    """Precision and recall at fixed thresholds, by pose and, beside it, by overlap."""
+    name = evaluation.score_name
+    heads = [
+        f"{name} >=",
+        "right poses",
+        "wrong poses",
+        "precision by pose",
+        "recall by pose",
+        "precision by overlap",
+        "recall by overlap",
+    ]
     rows = [
         [
             f"{row[f'min_{name}']:g}",
-            f"{row['precision']:.3f}",
-            f"{row['recall']:.3f}",
-            str(row["true_positives"]),
-            str(row["false_positives"]),
-            str(row["false_negatives"]),
-            f"{row['pose_precision']:.3f}",
+            str(row["right_poses"]),
+            str(row["wrong_poses"]),
+            *(_number(row[key], 3) for key in ("pose_precision", "pose_recall", "precision", "recall")),
         ]
-        for row in summary["precision_recall"]
+        for row in evaluation.table
     ]
-    title = f"True match: bounding-box IoU > {summary['min_overlap']:g}"
-    heads = [f"{name} >=", "precision", "recall", "TP", "FP", "FN", "right pose"]
+    title = f"Pairs above a threshold; recall of those with {OVERLAPS['box']} > {evaluation.min_overlap:g}"
     console.print(table_of(title, heads, rows))
-    _show_metrics(console, metrics, summary["min_overlap"])
+
+
+def _show_metrics(console: Console, evaluation: "Evaluation") -> None:
+    """Each curve in three numbers."""
+    heads = ["right by", "recall at full precision", "max F1", "average precision"]
+    for overlap in evaluation.overlaps:
+        chosen = {name: evaluation.metrics[overlap, name] for name in CRITERIA}
+        rows = [
+            [name, str(m.recall_at_full_precision), str(m.max_f1), str(m.average_precision)]
+            for name, m in chosen.items()
+        ]
+        true = count_of(chosen["pose"].true_pairs, "true pair")
+        console.print()
+        console.print(table_of(f"{true}: {OVERLAPS[overlap]} > {evaluation.min_overlap:g}", heads, rows))
+
+
+def _show_legend(console: Console, evaluation: "Evaluation") -> None:
+    result = evaluation.as_dict()
+    below = result["accepted_less_overlap"] + result["accepted_disjoint"]
     console.print(
-        f"\n{summary['pairs']} pairs scored, {summary['true_pairs']} of them true. "
-        f"Accepted: {summary['accepted_true']} true, {summary['accepted_less_overlap']} that share less, "
-        f"{summary['accepted_disjoint']} that share nothing; "
-        f"{summary['accepted_wrong_pose']} with a wrong pose."
+        "\nBy pose, a match is right if its pose is; a pair that shares less ground but has the right pose "
+        "is neither found nor false. By overlap, the criterion of the paper, every match of a pair that "
+        f"shares no more than {evaluation.min_overlap:g} is false, whatever its pose: here {below} of the "
+        f"{count_of(result['accepted'], 'accepted loop')}. In parentheses: 95 % bootstrap intervals."
     )
-    if summary["accepted_true"]:
-        console.print(
-            f"Median error of the true ones: {summary['median_position_error_m']:.3f} m, "
-            f"{summary['median_yaw_error_deg']:.2f} deg, {summary['median_height_error_m']:.3f} m in z."
-        )
-    for band, recall in summary["recall_before_first_disjoint"].items():
-        count = summary["pairs_by_overlap"][band]
+    for band, recall in result["recall_before_first_disjoint"].items():
+        count = result["pairs_by_overlap"][band]
         if count:
             console.print(
-                f"IoU {band}: {recall:.0%} of {count} pairs score above every pair that shares nothing."
+                f"IoU {band}: {100 * recall:.0f} % of {count_of(count, 'pair')} "
+                "score above every pair that shares nothing."
             )
 
 
-def _show_metrics(console: Console, metrics: Mapping[tuple[str, str], "Metrics"], min_overlap: float) -> None:
-    heads = ["right by", "recall at P = 1", "max F1", "average P"]
-    for kind, what in TRUTHS.items():
-        rows = [
-            [
-                right_by,
-                str(numbers.recall_at_full_precision),
-                str(numbers.max_f1),
-                str(numbers.average_precision),
-            ]
-            for (of, right_by), numbers in metrics.items()
-            if of == kind
-        ]
-        if rows:
-            count = count_of(metrics[kind, "overlap"].true_pairs, "true pair")
-            console.print()
-            console.print(table_of(f"{what} > {min_overlap:g}: {count}", heads, rows))
-    console.print(
-        "\nIn brackets: 95 % of the bootstrap. By overlap (the paper), pairs that share less are false "
-        "even if their pose is right; by pose, such pairs do not count."
-    )
+def _ratio(value: float, part: int, whole: int) -> str:
+    return f"{_number(value, 2)} ({part} of {whole})"
 
 
-def _scores(pairs: Sequence["Judged"], match: "MatchSettings") -> tuple[str, Sequence[int], list[float]]:
-    """What is thresholded, at what, and its value for each pair; -inf for those without a transform."""
-    if match.decision == "evidence":
-        comparable = [bool(np.isfinite(pair.candidate.T_target_source).all()) for pair in pairs]
-        values = [pair.candidate.score for pair in pairs]
-        name, thresholds = "score", SCORE_THRESHOLDS
-    else:  # Algorithm 1 returns the inliers of an acceptable transform only
-        comparable = [pair.candidate.ssd_ratio <= match.max_ssd_ratio for pair in pairs]
-        values = [float(pair.candidate.inliers) for pair in pairs]
-        name, thresholds = "inliers", INLIER_THRESHOLDS
-    found = [value if able else -np.inf for value, able in zip(values, comparable, strict=True)]
-    return name, thresholds, found
-
-
-def _observed(folder: Path, records: Sequence["SubmapRecord"], poses: "Array") -> "Array":
-    """IoU of the ground that the clouds of a mission observed; broken ones share nothing."""
-    from terrainloop.evaluation.overlap import ground_cell, observed_iou
-    from terrainloop.io.missions import load_mission
-
-    mission = load_mission(folder)
-    if mission.names != tuple(record.name for record in records):
-        raise TerrainLoopError(
-            expected=f"the {len(records)} clouds of the run in {folder}",
-            found=count_of(len(mission), "cloud") if len(mission) != len(records) else "other names",
-            mend="give the mission that was detected on",
-        )
-    whole = [record.status == "ok" for record in records]
-    clouds = [mission.read(i).points if ok else np.empty((0, 3)) for i, ok in enumerate(whole)]
-    return observed_iou(clouds, poses, ground_cell(clouds))
-
-
-def _draw(
-    path: Path,
-    points: Sequence["OperatingPoint"],
-    read: Mapping[tuple[str, str], "Reading"],
-    metrics: Mapping[tuple[str, str], "Metrics"],
-    title: str,
-    name: str,
-) -> None:
-    """The curves by bounding boxes; the fixed thresholds marked on the paper's."""
-    from terrainloop.report.figures import figure_precision_recall, save_figure
-
-    curves = {
-        f"right by {right_by}: AP {metrics[kind, right_by].average_precision}": reading.curve()
-        for (kind, right_by), reading in read.items()
-        if kind == "box"
-    }
-    save_figure(figure_precision_recall(points, title, f"least {name}", curves), path)
-
-
-def _curve_rows(read: Mapping[tuple[str, str], "Reading"]) -> list[list[Any]]:
-    return [
-        [*key, point.threshold, *(getattr(point, count) for count in _COUNTS)]
-        for key, reading in read.items()
-        for point in reading.curve()
-    ]
-
-
-def _row(name: str, point: "OperatingPoint", pose_precision: float) -> dict[str, float]:
-    counts = {count: getattr(point, count) for count in _COUNTS}
-    return {f"min_{name}": int(point.threshold), **counts, "pose_precision": pose_precision}
-
-
-def _write_rows(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([columns, *rows])
-
-
-def _median(values: Sequence[float]) -> float:
-    return float(np.median(values)) if values else float("nan")
+def _number(value: float, digits: int) -> str:
+    """A number, or a dash where nothing can be claimed."""
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"

@@ -1,5 +1,7 @@
 """``terrainloop match``: two clouds, loop or not."""
 
+import logging
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,6 +27,11 @@ from terrainloop.cli.terminal import (
 if TYPE_CHECKING:
     from terrainloop.loop import LoopCandidate
 
+logger = logging.getLogger(__name__)
+
+
+HELP = "Match cloud A against cloud B: a loop closure or not, and the transform from A to B."
+
 
 def command(
     source: Annotated[Path, typer.Argument(help="Cloud A, metres, gravity-aligned.")],
@@ -39,7 +46,7 @@ def command(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Match cloud A against cloud B: a loop closure or not, and the transform from A to B."""
+    """Run ``terrainloop match``."""
     from terrainloop.detection.detector import map_pair
     from terrainloop.io.clouds import read_cloud
     from terrainloop.io.results import loop_to_dict
@@ -49,10 +56,13 @@ def command(
     settings = read_settings(preset, config, seed, max_false_loops)
     if figure is not None:
         check_output(figure, (".png",))
+        import_module("terrainloop.report.figures")  # refuses where matplotlib is missing
     submaps = read_cloud(source), read_cloud(target)
     with terminal.progress() as progress:
         progress("match", 0, 2)
         entries = map_pair(*submaps, settings, workers=worker_count(workers))
+        for entry in entries:
+            logger.info("%s", entry.summary)
         progress("match", 1, 2)
         candidate = compare(*entries, settings)
         progress("match", 2, 2)
@@ -67,7 +77,7 @@ def _show(console: Console, candidate: "LoopCandidate") -> None:
     from terrainloop.geometry import parameters_of
 
     verdict = "loop closure" if candidate else "no loop closure"
-    console.print(f"{candidate.source} to {candidate.target}: {verdict}: {candidate.reason}", markup=False)
+    console.print(f"{candidate.source} to {candidate.target}: {verdict}: {candidate.reason}")
     if not candidate:
         return
     values, spread = parameters_of(candidate.T_target_source), np.sqrt(np.diag(candidate.covariance))
@@ -80,6 +90,5 @@ def _show(console: Console, candidate: "LoopCandidate") -> None:
     if candidate.source_origin.any() or candidate.target_origin.any():
         console.print("  the +/- are those about points near the clouds: their frames' origins are far away")
     console.print(
-        f"  overlap {candidate.overlap:.0%}; takes points of {candidate.source} into {candidate.target}",
-        markup=False,
+        f"  overlap {candidate.overlap:.0%}; takes points of {candidate.source} into {candidate.target}"
     )

@@ -5,7 +5,10 @@ from typing import Annotated
 
 import typer
 
-from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose
+from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose, check_folder
+from terrainloop.errors import printable
+
+HELP = "Simulate a rover's drive over rough ground: clouds, odometry.tum that drifts, truth.tum."
 
 
 def command(
@@ -18,11 +21,12 @@ def command(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Simulate a rover's drive over rough ground: clouds, odometry.tum that drifts, truth.tum."""
-    from terrainloop.simulation.missions import simulate_mission, write_mission
+    """Run ``terrainloop simulate``."""
+    from terrainloop.simulation.missions import simulate_mission, write_mission, written_before
 
     terminal = Terminal.open(as_json, quiet, verbose)
-    output.mkdir(parents=True, exist_ok=True)
+    check_folder(output)
+    written_before(output)  # refuses before the work
     with terminal.progress() as progress:
         mission = simulate_mission(
             world, seed, submaps, sensor, progress=lambda done, total: progress("submaps", done, total)
@@ -40,7 +44,7 @@ def command(
     terminal.result(
         summary,
         lambda console: console.print(
-            f"{len(mission.clouds)} submaps, {points:,} points, written to {output}. "
-            f"Next: terrainloop detect {output} -o OUT"
+            f"{len(mission.clouds)} submaps, {points:,} points, written to {printable(str(output))}. "
+            f"Next: terrainloop detect {printable(str(output))} -o OUT"
         ),
     )

@@ -1,22 +1,25 @@
-"""What every command shares: its options, its voice, its progress bars."""
+"""What every command shares: its options, how it prints, its progress bars."""
 
 import json
 import logging
 import math
 import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
+from rich.cells import cell_len
 from rich.console import Console
-from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
-from terrainloop.errors import TerrainLoopError
+from terrainloop.errors import TerrainLoopError, printable
+from terrainloop.resources import usable_workers
 
 if TYPE_CHECKING:
     from terrainloop.config import Settings
@@ -34,11 +37,18 @@ SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of t
 AllowedOption = Annotated[
     float | None,
     typer.Option(
-        "--max-false-loops", help="Expected number of false loop closures per mission [default: 0.01]."
+        "--max-false-loops",
+        help="Expected number of false loop closures per mission.",
+        show_default="that of the settings",
     ),
 ]
 WorkersOption = Annotated[
-    int, typer.Option("--workers", min=0, help="Parallel workers; 0: one per core. Results do not change.")
+    int,
+    typer.Option(
+        "--workers",
+        min=0,
+        help="Parallel workers, at most one per core; 0: one per core. Results do not change.",
+    ),
 ]
 
 
@@ -48,33 +58,29 @@ class Terminal:
 
     as_json: bool
     quiet: bool
+    remarks: Console
 
     @classmethod
     def open(cls, as_json: bool, quiet: bool, verbose: bool) -> "Terminal":
         """Set up logging as the user asked, and return the terminal."""
         level = logging.ERROR if quiet else logging.INFO if verbose else logging.WARNING
-        handler = RichHandler(console=Console(stderr=True), show_path=False, show_time=False)
-        logging.basicConfig(level=level, format="%(message)s", handlers=[handler], force=True)
-        return cls(as_json, quiet)
+        remarks = console_of(sys.stderr)
+        logging.basicConfig(level=level, format="%(message)s", handlers=[_Remarks(remarks)], force=True)
+        return cls(as_json, quiet, remarks)
 
     def result(self, value: Any, show: Callable[[Console], None]) -> None:
         """Print the result once: as JSON if asked for, else as `show` does unless quiet."""
         if self.as_json:
             typer.echo(json.dumps(_plain(value), indent=2, allow_nan=False))
         elif not self.quiet:
-            show(Console(highlight=False))
-
-    def say(self, text: str) -> None:
-        """A remark on stderr."""
-        if not self.quiet:
-            Console(stderr=True, highlight=False).print(text)
+            show(console_of(sys.stdout))
 
     @contextmanager
     def progress(self) -> Iterator[Callable[[str, int, int], None]]:
         """A bar for each stage; yields the callable (stage, done, total) that moves them."""
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         hidden = self.quiet or self.as_json
-        with Progress(*columns, console=Console(stderr=True), disable=hidden) as bars:
+        with Progress(*columns, console=self.remarks, disable=hidden) as bars:
             tasks: dict[str, Any] = {}
 
             def move(stage: str, done: int, total: int) -> None:
@@ -83,6 +89,25 @@ class Terminal:
                 bars.update(tasks[stage], completed=done, total=total)
 
             yield move
+
+
+def console_of(stream: TextIO) -> Console:
+    """A console that prints text as it is: brackets are no markup, and long lines are not broken."""
+    return Console(file=stream, highlight=False, markup=False, soft_wrap=True)
+
+
+class _Remarks(logging.Handler):
+    """Log messages as lines on a console, above its progress bars."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__()
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        message = printable(record.getMessage())
+        if record.exc_info:
+            message += "\n" + logging.Formatter().formatException(record.exc_info)
+        self._console.print(f"{record.levelname.lower()}: {message}")
 
 
 def _plain(value: Any) -> Any:
@@ -95,12 +120,13 @@ def _plain(value: Any) -> Any:
 
 
 def table_of(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """A table with its columns to the right, as numbers are read."""
-    table = Table(title=title, title_justify="left", show_edge=False, pad_edge=False)
-    for column in columns:
-        table.add_column(column, justify="right", no_wrap=True)
+    """A right-aligned table that never cuts a cell: where it is too wide, headers wrap, then it overflows."""
+    table = Table(title=Text(title), title_justify="left", show_edge=False, pad_edge=False)
+    for index, column in enumerate(columns):
+        least = max(map(cell_len, [*column.split(), *(row[index] for row in rows)]), default=1)
+        table.add_column(Text(column), justify="right", overflow="fold", min_width=least)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(Text, row))
     return table
 
 
@@ -120,22 +146,47 @@ def read_settings(
 
 
 def check_output(path: Path, suffixes: Sequence[str]) -> None:
-    """Refuse an output that could not be written, before the work is done."""
+    """Refuse a file that could not be written, before the work is done."""
     if path.suffix.lower() not in suffixes:
         raise TerrainLoopError(
             expected=f"an output that ends in {' or '.join(suffixes)}", found=str(path), mend="rename it"
+        )
+    if path.is_dir():
+        raise TerrainLoopError(
+            expected=f"a file to write at {path}", found="a folder", mend="give another name"
         )
     if not path.parent.is_dir():
         raise TerrainLoopError(
             expected=f"a folder for {path.name}", found=f"no folder {path.parent}", mend="make it first"
         )
+    _check_writable(path.parent)
+    if path.exists():
+        _check_writable(path)
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse an output folder that could not be made or written to, before the work is done."""
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise TerrainLoopError(
+            expected=f"a folder for the results at {folder}",
+            found=f"a file at {existing}",
+            mend="give another folder",
+        )
+    _check_writable(existing)
+
+
+def _check_writable(path: Path) -> None:
+    if not os.access(path, os.W_OK):
+        raise TerrainLoopError(
+            expected=f"permission to write to {path}", found="none", mend="write elsewhere, or change it"
+        )
 
 
 def worker_count(workers: int) -> int:
-    """As asked for, or one per core."""
-    if workers:
-        return workers
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """As many as asked for, at most one per core; 0: one per core that this process may use."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return usable_workers(workers or usable)
 
 
 def count_of(number: int, noun: str) -> str:

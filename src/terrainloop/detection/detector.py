@@ -1,5 +1,6 @@
 """LoopDetector: submaps go in one by one, loop closures come out."""
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from threading import Lock
@@ -12,11 +13,17 @@ from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import Array
 from terrainloop.gp.hyperparameters import fit_hyperparameters
 from terrainloop.gp.kernel import Hyperparameters
+from terrainloop.gp.training import TrainingData, detrend
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.register import compare_many
 from terrainloop.record import SubmapRecord
+from terrainloop.resources import check_memory, memory_errors
 from terrainloop.submap import UNNAMED, Submap
+
+logger = logging.getLogger(__name__)
+
+FEATURE_BYTES_PER_PIXEL = 250  # of SIFT, at the peak (docs/solver.md)
 
 PairSink = Callable[[LoopCandidate], object]
 
@@ -105,15 +112,13 @@ class LoopDetector:
                 expected="a Submap", found=f"a {type(submap).__name__}", mend="pass Submap(points, name=...)"
             )
         with self._adding:
-            parameters = self.parameters
-            if parameters is None and self.settings.map.fit == "database":
-                parameters = fit_database([submap], self.settings, workers=self.workers)
-            query = map_submap(submap, self.settings, parameters, workers=self.workers)
+            query = map_submap(submap, self.settings, self.parameters, workers=self.workers)
             if submap.name == UNNAMED:
                 name = f"{UNNAMED}_{len(self.entries):06d}"
                 query = replace(query, record=replace(query.record, name=name))
             loops = self._add(query)
-            self.parameters = parameters
+            if self.settings.map.fit == "database":
+                self.parameters = query.gradient_map.parameters
             return loops
 
     def add_entry(self, query: MapEntry) -> list[LoopCandidate]:
@@ -141,11 +146,13 @@ class LoopDetector:
         return loops
 
 
-def fit_database(submaps: Sequence[Submap], settings: Settings, *, workers: int = 1) -> Hyperparameters:
+def fit_database(
+    clouds: Sequence[Submap | TrainingData], settings: Settings, *, workers: int = 1
+) -> Hyperparameters:
     """Hyperparameters for all maps of a database, so that they are comparable."""
     limits = [n for n in (settings.map.max_points, settings.map.fit_points) if n is not None]
     return fit_hyperparameters(
-        submaps,
+        clouds,
         length_scale=settings.map.length_scale,
         noise=settings.map.noise,
         max_points=min(limits, default=None),
@@ -156,13 +163,20 @@ def fit_database(submaps: Sequence[Submap], settings: Settings, *, workers: int 
     )
 
 
+def detrend_submap(submap: Submap, settings: Settings) -> TrainingData:
+    """What the Gaussian process is fitted to and predicted from."""
+    return detrend(submap, remove_plane=settings.map.remove_plane)
+
+
 def map_submap(
     submap: Submap,
     settings: Settings,
     parameters: Hyperparameters | None = None,
     *,
+    data: TrainingData | None = None,
     odometry: Array | None = None,
     workers: int = 1,
+    max_memory: float | None = None,
 ) -> MapEntry:
     """The gradient map of a submap, its keypoints and its field.
 
@@ -172,38 +186,52 @@ def map_submap(
     settings : Settings
     parameters : Hyperparameters, optional
         Of the database; without them they are fitted to this submap.
+    data : TrainingData, optional
+        Of `detrend_submap`, where it is known.
     odometry : array, (4, 4), optional
         T_world_submap by odometry.
     workers : int
         Threads; the result does not depend on their number.
+    max_memory : float, optional
+        Bytes that the map may take; all that are available if not given.
+
+    Raises
+    ------
+    TerrainLoopError
+        If no map can be made, or there is not enough memory.
     """
-    parameters = parameters or fit_database([submap], settings, workers=workers)
+    data = data or detrend_submap(submap, settings)
+    parameters = parameters or fit_database([data], settings, workers=workers)
     gradient_map = GradientMap.from_points(
-        submap,
+        data,
         parameters.length_scale,
         parameters.variance,
         parameters.noise,
         settings.map.resolution,
         max_points=settings.map.max_points,
-        remove_plane=settings.map.remove_plane,
         local_noise=settings.map.local_noise,
         solver=settings.map.solver,
         max_variance_ratio=settings.map.max_variance_ratio,
         seed=settings.seed,
         workers=workers,
+        max_memory=max_memory,
     )
-    odometry = None if odometry is None else np.array(odometry, dtype=float)
-    return MapEntry.of(SubmapRecord.of(submap, odometry), gradient_map, settings)
+    record = SubmapRecord.of(submap, None if odometry is None else np.array(odometry, dtype=float))
+    for words in gradient_map.warnings:
+        logger.warning("%s: %s", submap.name, words)
+    record = replace(record, notes="; ".join(filter(None, [record.notes, *gradient_map.warnings])))
+    check_memory(FEATURE_BYTES_PER_PIXEL * gradient_map.mask.size, "the keypoints of a map", max_memory)
+    with memory_errors("the keypoints of a map"):
+        return MapEntry.of(record, gradient_map, settings)
 
 
 def map_pair(
     source: Submap, target: Submap, settings: Settings, *, workers: int = 1
 ) -> tuple[MapEntry, MapEntry]:
     """Two submaps at rest with the same hyperparameters, so that they can be compared."""
-    shared = None
-    if settings.map.fit == "database":
-        shared = fit_database([source, target], settings, workers=workers)
+    data = [detrend_submap(submap, settings) for submap in (source, target)]
+    shared = fit_database(data, settings, workers=workers) if settings.map.fit == "database" else None
     return (
-        map_submap(source, settings, shared, workers=workers),
-        map_submap(target, settings, shared, workers=workers),
+        map_submap(source, settings, shared, data=data[0], workers=workers),
+        map_submap(target, settings, shared, data=data[1], workers=workers),
     )

@@ -1,9 +1,9 @@
 """A whole mission at once: maps in parallel processes, then every pair."""
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Mapping
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -11,15 +11,17 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from terrainloop.config import Settings
-from terrainloop.detection.detector import LoopDetector, PairSink, fit_database, map_submap
-from terrainloop.detection.run import Run, RunWriter
+from terrainloop.detection.detector import LoopDetector, PairSink, detrend_submap, fit_database, map_submap
+from terrainloop.detection.run import Run, RunWriter, Tally
 from terrainloop.detection.workers import map_in_processes
 from terrainloop.entry import MapEntry
-from terrainloop.errors import TerrainLoopError
+from terrainloop.errors import TerrainLoopError, printable
 from terrainloop.gp.kernel import Hyperparameters
+from terrainloop.gp.training import TrainingData
 from terrainloop.io.missions import Mission, load_mission
 from terrainloop.loop import LoopCandidate
 from terrainloop.record import SubmapRecord
+from terrainloop.resources import available_memory, usable_workers
 from terrainloop.submap import Submap
 
 logger = logging.getLogger(__name__)
@@ -36,6 +38,11 @@ class MappedCloud:
     record: SubmapRecord
     entry: MapEntry | None
 
+    def __str__(self) -> str:
+        if self.entry is None:
+            return f"{self.record.name}: left out: {self.record.notes}"
+        return self.entry.summary
+
 
 def detect_mission(
     mission: Mission | Path | str,
@@ -49,7 +56,7 @@ def detect_mission(
     """Find the loop closures of a mission, leaving out clouds that are broken.
 
     An interrupt (Ctrl-C) ends the comparison of pairs early; what was found by then is returned and written,
-    with ``run.complete`` false.
+    with ``run.complete`` false. Before the first pair, and whatever else is raised, nothing is written.
 
     Parameters
     ----------
@@ -61,7 +68,8 @@ def detect_mission(
     on_pair : callable
         Called with every LoopCandidate as it is decided, rejected ones too.
     workers : int
-        Processes for the maps, threads for the pairs; the result does not depend on their number.
+        Processes for the maps, threads for the pairs, no more than there are processors; the result does
+        not depend on their number.
     on_progress : callable
         Called with (stage, done, total) as the work goes on.
 
@@ -73,13 +81,15 @@ def detect_mission(
     Raises
     ------
     TerrainLoopError
-        If no cloud can be used, or the output cannot be written.
+        If no cloud can be used.
+    OSError
+        If the output cannot be written; it names the folder.
     """
-    settings = settings or Settings()
+    settings, workers = settings or Settings(), usable_workers(workers)
     mission = mission if isinstance(mission, Mission) else load_mission(mission)
     if output is None:
         return _detect(mission, settings, on_pair, workers, on_progress)
-    with RunWriter(Path(output)) as writer:
+    with RunWriter.open(Path(output)) as writer:
 
         def keep(candidate: LoopCandidate) -> None:
             writer.add(candidate)
@@ -91,11 +101,14 @@ def detect_mission(
 def _detect(
     mission: Mission, settings: Settings, on_pair: PairSink, workers: int, on_progress: Progress
 ) -> Run:
-    parameters = _fit_mission(mission, settings, workers) if settings.map.fit == "database" else None
     clouds: list[MappedCloud] = []
-    for cloud in _map_clouds(mission, settings, parameters, workers):
-        clouds.append(cloud)
-        on_progress("maps", len(clouds), len(mission))
+    with _repairs_not_logged():
+        mapping = MissionMapping.of(mission, settings, workers)
+        with closing(mapping.clouds(workers)) as mapped:
+            for cloud in mapped:
+                clouds.append(cloud)
+                logger.info("%s", cloud)
+                on_progress("maps", len(clouds), len(mission))
     entries = [cloud.entry for cloud in clouds if cloud.entry is not None]
     if not entries:
         raise TerrainLoopError(
@@ -103,81 +116,137 @@ def _detect(
             found=f"{len(clouds)} broken, the first: {clouds[0].record.notes}",
             mend="correct the clouds or name another folder",
         )
-    compared = max(0, len(entries) - settings.skip_recent)
+    run = Run(
+        settings=settings,
+        parameters=mapping.parameters,
+        submaps=tuple(cloud.record for cloud in clouds),
+        loops=(),
+        entries={entry.id: entry for entry in entries},
+    )
+    return _compare(run, on_pair, workers, on_progress)
+
+
+def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -> Run:
+    """The run with its loops, after every submap was compared with the earlier ones."""
+    tally = Tally()
+
+    def count(candidate: LoopCandidate) -> None:
+        tally.add(candidate)
+        on_pair(candidate)
+
+    compared = max(0, len(run.entries) - run.settings.skip_recent)
     detector = LoopDetector(
-        settings,
-        parameters=parameters,
+        run.settings,
+        parameters=run.parameters,
         expected_pairs=compared * (compared - 1) // 2,
-        on_pair=on_pair,
+        on_pair=count,
         workers=workers,
     )
-    complete = True
     try:
         with threadpool_limits(1, user_api="blas"):
-            for done, entry in enumerate(entries, start=1):
+            for done, entry in enumerate(run.entries.values(), start=1):
                 detector.add_entry(entry)
-                on_progress("pairs", done, len(entries))
+                on_progress("pairs", done, len(run.entries))
     except KeyboardInterrupt:
         logger.warning(
-            "interrupted after %d of %d submaps: only the pairs compared by then are in the result",
+            "interrupted after %d of %d submaps: the result holds only the pairs compared by then",
             len(detector.entries),
-            len(entries),
+            len(run.entries),
         )
-        complete = False
-    return Run(
-        settings=settings,
-        parameters=parameters,
-        submaps=tuple(cloud.record for cloud in clouds),
-        loops=tuple(detector.loops),
-        entries=detector.entries,
-        complete=complete,
-    )
+        run = replace(run, complete=False)
+    return tally.of(run)
 
 
-def _fit_mission(mission: Mission, settings: Settings, workers: int) -> Hyperparameters | None:
-    """Hyperparameters of a few usable submaps spread over the mission; None if none is usable."""
-    spread = np.linspace(0, len(mission) - 1, FITTED_SUBMAPS + 2).astype(int)[1:-1].tolist()
-    submaps: list[Submap] = []
-    for index in dict.fromkeys([*spread, *range(len(mission))]):
-        if len(submaps) < FITTED_SUBMAPS:
-            with suppress(TerrainLoopError):
-                submaps.append(mission.read(index))
-    if not submaps:
-        return None
-    parameters = fit_database(submaps, settings, workers=workers)
-    logger.info(
-        "fitted on %s: length scale %.3g m, relief %.3g m, noise %.3g m",
-        ", ".join(submap.name for submap in submaps),
-        parameters.length_scale,
-        parameters.variance**0.5,
-        parameters.noise,
-    )
-    return parameters
+@contextmanager
+def _repairs_not_logged() -> Generator[None, None, None]:
+    """They are in the records: logged, they would depend on which process read the cloud, and how often."""
 
+    def never(record: logging.LogRecord) -> bool:
+        return False
 
-def _map_clouds(
-    mission: Mission, settings: Settings, parameters: Hyperparameters | None, workers: int
-) -> Iterator[MappedCloud]:
-    """Every cloud of the mission in order, mapped in as many processes as there are workers."""
-    task = partial(_map_cloud, mission, settings, parameters)
-    return map_in_processes(task, len(mission), workers, partial(_killed, mission))
-
-
-def _map_cloud(
-    mission: Mission, settings: Settings, parameters: Hyperparameters | None, index: int
-) -> MappedCloud:
-    """A cloud and its map; whatever is wrong with it, the mission goes on without it."""
+    of_submaps = logging.getLogger(Submap.__module__)
+    of_submaps.addFilter(never)
     try:
-        submap = mission.read(index)
-        odometry = None if mission.odometry is None else mission.odometry.poses[index]
-        entry = map_submap(submap, settings, parameters, odometry=odometry)
-        return MappedCloud(entry.record, entry)
-    except TerrainLoopError as error:
-        return _broken(mission, index, str(error))
-    except MemoryError:
-        return _broken(mission, index, "not enough memory for its map: use fewer workers, or cut the cloud")
-    except Exception as error:  # not even a fault of ours may end a mission of hours
-        return _broken(mission, index, f"a fault of terrainloop, please report it: {error!r}")
+        yield
+    finally:
+        of_submaps.removeFilter(never)
+
+
+@dataclass(frozen=True, eq=False)
+class MissionMapping:
+    """How the clouds of a mission are mapped.
+
+    Attributes
+    ----------
+    mission : Mission
+    settings : Settings
+    parameters : Hyperparameters or None
+        Of all maps; None where each cloud has its own.
+    prepared : mapping of int to (Submap, TrainingData)
+        The clouds that the parameters were fitted on, by index: they are not read again.
+    max_memory : float
+        Bytes that one map may take.
+    """
+
+    mission: Mission
+    settings: Settings
+    parameters: Hyperparameters | None
+    prepared: Mapping[int, tuple[Submap, TrainingData]]
+    max_memory: float
+
+    @classmethod
+    def of(cls, mission: Mission, settings: Settings, workers: int) -> "MissionMapping":
+        """Fit the hyperparameters of a database on a few usable clouds spread over the mission."""
+        parameters, prepared = None, {}
+        if settings.map.fit == "database" and (prepared := _some_clouds(mission, settings)):
+            parameters = fit_database([data for _, data in prepared.values()], settings, workers=workers)
+            logger.info(
+                "fitted on %s: length scale %.3g m, relief %.3g m, noise %.3g m",
+                ", ".join(submap.name for submap, _ in prepared.values()),
+                parameters.length_scale,
+                parameters.variance**0.5,
+                parameters.noise,
+            )
+        return cls(mission, settings, parameters, prepared, available_memory() / workers)
+
+    def clouds(self, workers: int) -> Generator[MappedCloud, None, None]:
+        """Every cloud of the mission in order, mapped in as many processes as there are workers."""
+        return map_in_processes(self.cloud, len(self.mission), workers, partial(_killed, self.mission))
+
+    def cloud(self, index: int) -> MappedCloud:
+        """A cloud and its map; whatever is wrong with it, the mission goes on without it."""
+        mission = self.mission
+        try:
+            submap, data = self.prepared.get(index) or (mission.read(index), None)
+            entry = map_submap(
+                submap,
+                self.settings,
+                self.parameters,
+                data=data,
+                odometry=None if mission.odometry is None else mission.odometry.poses[index],
+                max_memory=self.max_memory,
+            )
+            return MappedCloud(entry.record, entry)
+        except TerrainLoopError as error:
+            return _broken(mission, index, str(error))
+        except MemoryError:
+            return _broken(
+                mission, index, "not enough memory for its map: use fewer workers, or cut the cloud"
+            )
+        except Exception as error:  # not even a fault of ours may end a mission of hours
+            return _broken(mission, index, f"a fault of terrainloop, please report it: {error!r:.300}")
+
+
+def _some_clouds(mission: Mission, settings: Settings) -> dict[int, tuple[Submap, TrainingData]]:
+    """A few usable clouds spread over the mission, and what the Gaussian process sees of them."""
+    spread = np.linspace(0, len(mission) - 1, FITTED_SUBMAPS + 2).astype(int)[1:-1].tolist()
+    clouds: dict[int, tuple[Submap, TrainingData]] = {}
+    for index in dict.fromkeys([*spread, *range(len(mission))]):
+        if len(clouds) < FITTED_SUBMAPS:
+            with suppress(TerrainLoopError):
+                submap = mission.read(index)
+                clouds[index] = submap, detrend_submap(submap, settings)
+    return clouds
 
 
 def _killed(mission: Mission, index: int) -> MappedCloud:
@@ -185,5 +254,5 @@ def _killed(mission: Mission, index: int) -> MappedCloud:
 
 
 def _broken(mission: Mission, index: int, notes: str) -> MappedCloud:
-    stamp = mission.stamp(index)
-    return MappedCloud(SubmapRecord(mission.names[index], stamp, 0, "broken", notes=notes), None)
+    name, stamp = printable(mission.names[index]), mission.stamp(index)
+    return MappedCloud(SubmapRecord(name, stamp, 0, "broken", notes=notes), None)

@@ -1,28 +1,40 @@
 """A run: what a command leaves in its output folder, written whole or not at all, and read back."""
 
-import json
+import errno
 import os
-import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from terrainloop import __version__
 from terrainloop.config import Settings
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.kernel import Hyperparameters
-from terrainloop.io.results import LoopFile, iterate_loops, read_loops, read_submaps, write_loops, write_submaps
+from terrainloop.io.files import write_whole_text
+from terrainloop.io.results import (
+    LoopFile,
+    iterate_loops,
+    read_loops,
+    read_submaps,
+    write_loops,
+    write_submaps,
+)
+from terrainloop.io.staging import errors_naming, publish, staging
 from terrainloop.loop import LoopCandidate
 from terrainloop.record import SubmapRecord
 
 LOOPS, PAIRS, SUBMAPS, CONFIG, RUN = "loops.csv", "pairs.csv", "submaps.csv", "config.yaml", "run.json"
 OF_A_RUN = (RUN, LOOPS, PAIRS, SUBMAPS, CONFIG)
 """Files of every run."""
-DERIVED = ("precision_recall.csv", "precision_recall_curve.csv", "precision_recall.png")
+DERIVED = (
+    *("precision_recall.csv", "precision_recall_curve.csv", "precision_recall.png"),  # evaluate
+    *("mission.png", "map.png", "match.png"),  # demo
+)
 """Files that other commands add; those of an earlier run are stale."""
 
 
@@ -89,83 +101,134 @@ class Run:
             If a file is missing or damaged.
         """
         folder = Path(folder)
-        about = _read_about(folder / RUN)
-        kept = about.get("hyperparameters")
+        missing = [name for name in (LOOPS, PAIRS, SUBMAPS, CONFIG) if not (folder / name).is_file()]
+        if missing:
+            raise TerrainLoopError(
+                expected=f"the results of a run in {folder}",
+                found=f"no {', '.join(missing)}",
+                mend="give the output folder of 'terrainloop detect'",
+            )
+        about = _About.read(folder / RUN)
+        loops = tuple(read_loops(folder / LOOPS))
+        if about.loops not in (None, len(loops)):
+            raise TerrainLoopError(
+                expected=f"{about.loops} loops in {folder / LOOPS}, as {RUN} has it",
+                found=str(len(loops)),
+                mend="detect again",
+            )
         return cls(
             settings=Settings.from_yaml(folder / CONFIG),
-            parameters=Hyperparameters(**kept) if kept else None,
+            parameters=about.hyperparameters,
             submaps=tuple(read_submaps(folder / SUBMAPS)),
-            loops=tuple(read_loops(folder / LOOPS)),
-            rejections=about.get("rejections", {}),
-            complete=about.get("complete", True),
+            loops=loops,
+            rejections=about.rejections,
+            complete=about.complete,
             folder=folder,
         )
+
+
+class Tally:
+    """The loops among pairs, and the number of the others by the first clause of the reason."""
+
+    def __init__(self, candidates: Iterable[LoopCandidate] = ()) -> None:
+        self._loops: list[LoopCandidate] = []
+        self._rejections: Counter[str] = Counter()
+        for candidate in candidates:
+            self.add(candidate)
+
+    def add(self, candidate: LoopCandidate) -> None:
+        """Count one pair."""
+        if candidate:
+            self._loops.append(candidate)
+        else:
+            self._rejections[candidate.reason.partition(":")[0]] += 1
+
+    def of(self, run: Run) -> Run:
+        """The run with these loops and rejections."""
+        return replace(run, loops=tuple(self._loops), rejections=dict(self._rejections.most_common()))
 
 
 class RunWriter:
     """Writes a run aside while it goes on, and moves it into its folder when it is finished.
 
-    Pairs go to disk as they come. What an earlier run left in the folder is replaced; other files are not
-    touched.
+    Pairs go to disk as they come. What an earlier run left in the folder is replaced when the new one is
+    complete; other files are not touched. Errors of the disk name the folder.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._aside = folder / f".terrainloop-{os.getpid()}"
-        self._rejections: Counter[str] = Counter()
+    def __init__(self, folder: Path, aside: Path) -> None:
+        self._folder, self._aside = folder, aside
+        self._pairs = LoopFile(aside / PAIRS)
 
-    def __enter__(self) -> "RunWriter":
-        self._aside.mkdir(parents=True, exist_ok=True)
-        self._pairs = LoopFile(self._aside / PAIRS)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._pairs.close()
-        shutil.rmtree(self._aside, ignore_errors=True)
+    @classmethod
+    @contextmanager
+    def open(cls, folder: Path) -> Iterator["RunWriter"]:
+        """A writer into `folder`; what it wrote is gone at the end, unless `finish` was called."""
+        for name in (*OF_A_RUN, *DERIVED):
+            if (folder / name).is_dir():
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(folder / name))
+        with staging(folder) as aside:
+            with errors_naming(folder):
+                writer = cls(folder, aside)
+            try:
+                yield writer
+            finally:
+                with suppress(OSError):  # of the last lines, on a full disk
+                    writer._pairs.close()
 
     def add(self, candidate: LoopCandidate) -> None:
         """Write one pair."""
-        self._pairs.write(candidate)
-        if not candidate:
-            self._rejections[candidate.reason.partition(":")[0]] += 1
+        with errors_naming(self._folder):
+            self._pairs.write(candidate)
 
     def finish(self, run: Run) -> Run:
         """Write the rest of the run and move all of it into the folder."""
-        run = replace(run, rejections=dict(self._rejections.most_common()), folder=self._folder)
-        self._pairs.close()
-        write_loops(self._aside / LOOPS, run.loops)
-        write_submaps(self._aside / SUBMAPS, run.submaps)
-        (self._aside / CONFIG).write_text(run.settings.to_yaml(), encoding="utf-8")
-        (self._aside / RUN).write_text(json.dumps(_about(run), indent=2) + "\n", encoding="utf-8")
-        for name in (*OF_A_RUN, *DERIVED):
-            (self._folder / name).unlink(missing_ok=True)
-        for name in reversed(OF_A_RUN):
-            (self._aside / name).replace(self._folder / name)
+        with errors_naming(self._folder):
+            self._pairs.close()
+            if not run.complete:  # it may have been interrupted between writing a pair and counting it
+                run = Tally(iterate_loops(self._aside / PAIRS)).of(run)
+            run = replace(run, folder=self._folder)
+            write_loops(self._aside / LOOPS, run.loops)
+            write_submaps(self._aside / SUBMAPS, run.submaps)
+            about, settings = _About.of(run).to_json(), run.settings.to_yaml()
+            write_whole_text(self._aside / RUN, lambda file: file.write(about))
+            write_whole_text(self._aside / CONFIG, lambda file: file.write(settings))
+        publish(self._aside, self._folder, reversed(OF_A_RUN), stale=(*OF_A_RUN, *DERIVED))
         return run
 
 
-def _about(run: Run) -> dict[str, Any]:
-    """What no other file of the run holds."""
-    return {
-        "terrainloop": __version__,
-        "complete": run.complete,
-        "hyperparameters": None if run.parameters is None else asdict(run.parameters),
-        "pairs": run.num_pairs,
-        "loops": len(run.loops),
-        "rejections": dict(run.rejections),
-    }
+class _About(BaseModel):
+    """What no other file of the run holds: run.json. Earlier versions wrote none, or less."""
 
+    model_config = ConfigDict(allow_inf_nan=False)
 
-def _read_about(path: Path) -> dict[str, Any]:
-    """The content of run.json, or nothing where there is none."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        if not isinstance(content, dict):
-            raise ValueError("it is no JSON object")
-        return content
-    except (OSError, ValueError) as error:
-        raise TerrainLoopError(
-            expected=f"a description of the run in {path}", found=str(error), mend="detect again"
-        ) from error
+    terrainloop: str = "unknown"
+    complete: bool = True
+    hyperparameters: Hyperparameters | None = None
+    pairs: int | None = None
+    loops: int | None = None
+    rejections: dict[str, int] = {}
+
+    @classmethod
+    def of(cls, run: Run) -> "_About":
+        return cls(
+            terrainloop=__version__,
+            complete=run.complete,
+            hyperparameters=run.parameters,
+            pairs=run.num_pairs,
+            loops=len(run.loops),
+            rejections=dict(run.rejections),
+        )
+
+    def to_json(self) -> str:
+        return self.model_dump_json(indent=2) + "\n"
+
+    @classmethod
+    def read(cls, path: Path) -> "_About":
+        """The content of run.json, or the defaults where there is none."""
+        try:
+            return cls.model_validate_json(path.read_bytes()) if path.exists() else cls()
+        except (OSError, ValidationError) as error:
+            found = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error.strerror)
+            raise TerrainLoopError(
+                expected=f"a description of the run in {path}", found=found, mend="detect again"
+            ) from error

@@ -1,1 +1,1 @@
-"""Evaluation: loop candidates held against the truth."""
+"""Evaluation: scored pairs of submaps against ground truth."""

@@ -1,4 +1,4 @@
-"""Which pairs of submaps truly share ground: by bounding boxes (paper, section VI-A), by ground observed."""
+"""Overlap of submaps: of their bounding boxes (paper, section VI-A), and of the ground they observed."""
 
 from collections.abc import Sequence
 
@@ -9,8 +9,8 @@ from scipy.sparse import csr_array
 from terrainloop.geometry import Array, transform
 
 CELLS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # metres
-SAME_GROUND = 0.95  # IoU of a place with itself that is good enough
-LOOKED_AT = 10  # clouds of a mission that tell how dense all are
+SAME_GROUND = 0.95  # IoU of two halves of a cloud that counts as the same ground
+SAMPLED_CLOUDS = 10  # clouds of a mission from which the cell size is chosen
 
 
 def world_boxes(hulls: Sequence[Array], poses: Array) -> Array:
@@ -41,14 +41,15 @@ def box_iou(boxes: Array) -> Array:
     high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
     shared = np.clip(high - low, 0, None).prod(axis=-1)
     area = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)
-    return shared / (area[:, None] + area - shared)
+    union = area[:, None] + area - shared
+    return np.divide(shared, union, out=np.zeros_like(shared), where=union > 0)
 
 
 def observed_iou(clouds: Sequence[Array], poses: Array, cell: float) -> Array:
-    """Ground that both of two submaps hold points of, over ground that either does.
+    """Ground of which both of two submaps have points, over ground of which either has.
 
-    Ground is counted in square cells of the world's x-y plane; one point makes a cell observed. What lies
-    in a shadow, or in a corner of the bounding box that was never seen, is not shared.
+    Ground is counted in square cells of the world's x-y plane; one point makes a cell observed. Shadows,
+    and corners of the bounding box that were never seen, are not shared.
 
     Parameters
     ----------
@@ -76,15 +77,15 @@ def observed_iou(clouds: Sequence[Array], poses: Array, cell: float) -> Array:
 
 
 def ground_cell(clouds: Sequence[Array]) -> float:
-    """Side of the cells that the ground of these clouds is to be counted in, metres.
+    """Side of the cells in which the ground of these clouds is counted, metres.
 
     The smallest of 0.25, 0.5, 1, 2, 4 and 8 m at which two random halves of a cloud observe the same
-    ground (IoU at least 0.95 in the median cloud). Smaller ones leave holes between the points, and a
-    place would share too little with itself; larger ones smear the border. Halves are sparser than
-    clouds, so this is on the safe side. Some ten clouds are looked at, halved by a fixed seed.
+    ground (IoU at least 0.95 in the median cloud). Smaller cells leave holes between the points, so that
+    two scans of one place share too little; larger ones blur the border. Halves are sparser than clouds,
+    so the choice is conservative. Some ten clouds are sampled, and halved with a fixed seed.
     """
     whole = [cloud for cloud in clouds if len(cloud)]
-    some = whole[:: max(1, len(whole) // LOOKED_AT)]
+    some = whole[:: max(1, len(whole) // SAMPLED_CLOUDS)]
     rng = np.random.default_rng(0)
     halves = [(cloud[chosen], cloud[~chosen]) for cloud in some for chosen in [rng.random(len(cloud)) < 0.5]]
     still = np.broadcast_to(np.eye(4), (2, 4, 4))

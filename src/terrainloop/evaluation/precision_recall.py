@@ -46,18 +46,18 @@ class Estimate:
     high: float
 
     def __str__(self) -> str:
-        return f"{self.value:.2f} ({self.low:.2f}-{self.high:.2f})"
+        return "-" if np.isnan(self.value) else f"{self.value:.2f} ({self.low:.2f}-{self.high:.2f})"
 
 
 @dataclass(frozen=True)
 class Metrics:
-    """A precision-recall curve in three numbers.
+    """Three numbers that summarise a precision-recall curve.
 
     Attributes
     ----------
     pairs, true_pairs : int
     recall_at_full_precision : Estimate
-        Recall at the lowest threshold that admits no false match: what scores above all of them.
+        Recall at the lowest threshold that admits no false match.
     max_f1 : Estimate
         Largest 2 P R / (P + R).
     average_precision : Estimate
@@ -87,8 +87,8 @@ def precision_recall(
     thresholds : sequence of float, optional
         By default every distinct score, from high to low.
     is_right : array_like, (P,), optional
-        Whether the match, if made, is right. A true pair that is matched wrongly is a false positive,
-        and missed too.
+        Whether the match, if made, is right. A true pair that is matched wrongly is a false positive
+        and a false negative.
     """
     ranked = _Ranked.of(scores, is_true, is_right)
     if thresholds is None:
@@ -106,12 +106,12 @@ def precision_recall(
 def measure(
     scores: ArrayLike, is_true: ArrayLike, submaps: ArrayLike, is_right: ArrayLike | None = None
 ) -> Metrics:
-    """The curve over every distinct score in three numbers, with bootstrap intervals.
+    """Three numbers that summarise the curve over every distinct score, with bootstrap intervals.
 
-    Pairs of one submap stand or fall together, be it their source or their target, so submaps are
+    The pairs of one submap succeed or fail together, be it their source or their target, so submaps are
     resampled, not pairs: each resample draws as many submaps as there are, with replacement, and counts a
     pair as often as the product of how often its two submaps were drawn (the vertex bootstrap of Snijders
-    and Borgatti, Connections 22(2), 1999). Resamples without a true pair are passed over. Seeded: the same
+    and Borgatti, Connections 22(2), 1999). Resamples without a true pair are skipped. Seeded: the same
     pairs give the same interval.
 
     Parameters
@@ -148,7 +148,7 @@ def recall_at_full_precision(positive: ArrayLike, negative: ArrayLike) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Ranked:
-    """Pairs by falling score, without those that nothing matches.
+    """Pairs by decreasing score, without those that no threshold matches.
 
     `order` are their indices among all pairs, `ends` the last of each run of equal scores (which are one
     threshold); `scores` and `right` are in that order, `is_true` in that of all pairs.

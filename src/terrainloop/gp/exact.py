@@ -15,18 +15,20 @@ from itertools import pairwise
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, cholesky
+from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.linalg.lapack import dpotri
 from threadpoolctl import threadpool_limits
 
 from terrainloop.errors import TerrainLoopError
+from terrainloop.gp.grid import Grid
 from terrainloop.gp.kernel import Array, Hyperparameters, factor, squared_distances
-from terrainloop.gp.prediction import Prediction
+from terrainloop.gp.prediction import Prediction, Values
 
-REACH = 7.0  # length scales beyond which the kernel, below 3e-11, no longer counts
+KERNEL_RADIUS = 7.0  # length scales beyond which the kernel, below 3e-11, is negligible
 TILE = 6.0  # side of the tiles the variance is computed in, length scales
 NODES = 30  # along an axis of a tile: they interpolate the kernel to 1e-11
 MAX_TILE = 64  # pixels along an axis of a tile, which bounds memory
+BATCH = 256  # arbitrary points predicted at once, which bounds memory
 ROUNDING = 1e-12
 MAX_POINTS = 20_000  # 3.2 GB a matrix
 
@@ -75,26 +77,24 @@ def invert(cholesky_factor: Array) -> Array:
 def predict_grid(
     xy: Array,
     elevation: Array,
+    noise: Array,
     parameters: Hyperparameters,
-    x: Array,
-    y: Array,
+    grid: Grid,
     *,
-    noise: Array | None = None,
     workers: int = 1,
 ) -> Prediction:
-    """Posterior of the elevation and its gradient on the grid spanned by `x` and `y`.
+    """Posterior of the elevation and its gradient on a grid.
 
     Parameters
     ----------
     xy : array, (N, 2)
         Training points, metres.
-    elevation : array, (N,)
-        Their elevations, metres; the prior has zero mean.
+    elevation, noise : array, (N,)
+        Their elevations, the prior having zero mean, and the standard deviation of each, metres.
     parameters : Hyperparameters
-    x, y : array, (W,) and (H,)
-        Grid coordinates, metres.
-    noise : array, (N,), optional
-        Standard deviation of each point's elevation, metres; ``parameters.noise`` if not given.
+        Length scale and variance; the noise is given by point.
+    grid : Grid
+        Of H x W pixels.
     workers : int
         Threads; the result does not depend on it.
 
@@ -109,8 +109,9 @@ def predict_grid(
         If the covariance cannot be factorised, or there are more points than fit into memory.
     """
     check_size(len(xy))
+    x, y = grid.x, grid.y
     with threadpool_limits(1, user_api="blas"):  # BLAS sums in another order with more threads
-        lower = factorise(xy, parameters, parameters.noise if noise is None else noise)
+        lower = factorise(xy, parameters, noise)
         weights = parameters.variance * cho_solve((lower, True), elevation, check_finite=False)
         kx, dkx = factor(x, xy[:, 0], parameters.length_scale)
         ky, dky = factor(y, xy[:, 1], parameters.length_scale)
@@ -119,6 +120,42 @@ def predict_grid(
         del kx, dkx, ky, dky
         variance, gradient_variance = _variances(xy, invert(lower), parameters, x, y, workers)
     return Prediction(mean, gradient_x, gradient_y, variance, gradient_variance)
+
+
+def predict_at(
+    xy: Array,
+    elevation: Array,
+    noise: Array,
+    parameters: Hyperparameters,
+    queries: Array,
+    *,
+    workers: int = 1,
+) -> Prediction:
+    """Posterior at arbitrary points (Q, 2), metres; otherwise as `predict_grid`."""
+    check_size(len(xy))
+    length_scale, prior = parameters.length_scale, parameters.variance / parameters.length_scale**2
+    result = Prediction(*np.empty((5, len(queries))))
+    with threadpool_limits(1, user_api="blas"):
+        lower = factorise(xy, parameters, noise)
+        weights = cho_solve((lower, True), elevation, check_finite=False)
+
+        def explained(covariance: Array) -> Array:
+            half = solve_triangular(lower, covariance.T, lower=True, check_finite=False)
+            return np.einsum("ij,ij->j", half, half)
+
+        def solve(some: slice) -> None:
+            kx, dkx = factor(queries[some, 0], xy[:, 0], length_scale)
+            ky, dky = factor(queries[some, 1], xy[:, 1], length_scale)
+            k, by_x, by_y = (parameters.variance * product for product in (kx * ky, dkx * ky, kx * dky))
+            result.elevation[some], result.gradient_x[some] = k @ weights, by_x @ weights
+            result.gradient_y[some] = by_y @ weights
+            result.variance[some] = parameters.variance - explained(k)
+            result.gradient_variance[some] = prior - (explained(by_x) + explained(by_y)) / 2
+
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(solve, (slice(i, i + BATCH) for i in range(0, len(queries), BATCH))))
+    _keep_positive(result.variance, result.gradient_variance, parameters)
+    return result
 
 
 def _variances(
@@ -131,7 +168,7 @@ def _variances(
     derivative of k is one of b. Only the points within reach of a tile take part.
     """
     variance, gradient_variance = np.empty((len(y), len(x))), np.empty((len(y), len(x)))
-    side, reach = TILE * parameters.length_scale, REACH * parameters.length_scale
+    side, reach = TILE * parameters.length_scale, KERNEL_RADIUS * parameters.length_scale
     prior = parameters.variance / parameters.length_scale**2
 
     def solve(tile: tuple[slice, slice]) -> None:
@@ -153,10 +190,15 @@ def _variances(
     tiles = [(rows, columns) for rows in _chunks(y, side) for columns in _chunks(x, side)]
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(solve, tiles))
-    # A variance is positive even where cancellation leaves less.
-    np.maximum(variance, ROUNDING * parameters.variance, out=variance)
-    np.maximum(gradient_variance, ROUNDING * prior, out=gradient_variance)
+    _keep_positive(variance, gradient_variance, parameters)
     return variance, gradient_variance
+
+
+def _keep_positive(variance: Values, gradient_variance: Values, parameters: Hyperparameters) -> None:
+    """A variance is positive even where cancellation leaves less."""
+    smallest = ROUNDING * parameters.variance
+    np.maximum(variance, smallest, out=variance)
+    np.maximum(gradient_variance, smallest / parameters.length_scale**2, out=gradient_variance)
 
 
 def _interpolation(coordinates: Array, side: float) -> tuple[Array, Array, Array]:

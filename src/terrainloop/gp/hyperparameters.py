@@ -1,40 +1,43 @@
 """Length scale, variance and noise by maximum likelihood (Rasmussen & Williams 2006, ch. 5)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import astuple
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.linalg import cho_solve
 from scipy.optimize import Bounds, minimize
 from threadpoolctl import threadpool_limits
 
 from terrainloop import _core
 from terrainloop.errors import TerrainLoopError
+from terrainloop.gp.checks import check_max_points, check_positive, check_seed, core_errors
 from terrainloop.gp.exact import check_size, factorise, invert
 from terrainloop.gp.kernel import Array, Hyperparameters, squared_distances
-from terrainloop.gp.surface import Surface, surface_of
-from terrainloop.submap import Submap
+from terrainloop.gp.training import OCCUPANCY_CELLS, PATCH_SIDE, Points, TrainingData, detrend
+from terrainloop.resources import usable_workers
+from terrainloop.submap import MIN_POINTS
 
 # How far each hyperparameter may move from its start, as a factor. A length scale far below the
 # spacing of the points would only turn the terrain into noise.
 SPAN = {"length_scale": 10.0, "variance": 1e3, "noise": 1e3}
 
-# Drawn from a cloud for a fit: a few thousand lie further apart than stereo's errors reach (docs/solver.md).
+# Drawn from a cloud for a fit: a few thousand are further apart than stereo's errors are correlated
+# (docs/solver.md).
 FIT_POINTS = 5000
-ONLY_NOISE = 0.1  # of the noise squared: a smaller variance is no terrain
+MIN_SIGNAL = 0.1  # of the noise squared: a smaller variance is not terrain
+MIN_PATCH = 10.0  # length scales along the side of a patch: a plane subtracted from less takes the terrain
 
-# Of the blocks of a search: their side in length scales, and the sum of r^3 over their ranks r. The first
-# finds about where the length scale lies; the larger the blocks, the nearer to the likelihood of all points.
-SEARCHES = ((4.0, 3e7), (10.0, 1e9))
-ROUNDS = 6
-REACH = (1 / 1.5, 3.0)  # factors of the length scale that blocks are good for
-CLOSE = 1.25  # factor of the length scale within which they are at their best
-STANDARD_ERRORS = 0.3  # from the optimum, where a search ends
+# Stages of a search: side of the blocks in length scales, and the sum of r^3 over their ranks r. The first
+# finds about where the length scale is; the larger the blocks, the nearer to the likelihood of all points.
+BLOCK_STAGES = ((4.0, 3e7), (10.0, 1e9))
+MAX_ROUNDS = 6
+TRUST_REGION = (1 / 1.5, 3.0)  # factors of the length scale that blocks are good for
+CONVERGED_FACTOR = 1.25  # of the length scale, within which they are at their best
+GRADIENT_TOLERANCE = 0.3  # standard errors from the optimum, where a search ends
 
-WALL = 1e25  # turns a line search back
+PENALTY = 1e25  # turns a line search back
 
 Likelihood = Callable[[float, float, float], tuple[float, tuple[float, float, float]]]
 
@@ -72,8 +75,23 @@ def negative_log_likelihood(
     return float(value), np.array([by_length_scale, by_variance, by_noise])
 
 
+@dataclass(frozen=True)
+class FitOptions:
+    """How hyperparameters are fitted; see `fit_hyperparameters`."""
+
+    max_points: int | None = FIT_POINTS
+    exact: bool = False
+    remove_plane: bool = True
+    seed: int = 0
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "workers", usable_workers(self.workers))
+        check_seed(self.seed)
+
+
 def fit_hyperparameters(
-    clouds: Sequence[ArrayLike | Submap],
+    clouds: Sequence[Points],
     length_scale: float | None = None,
     variance: float | None = None,
     noise: float | None = None,
@@ -86,6 +104,9 @@ def fit_hyperparameters(
 ) -> Hyperparameters:
     """Fit the hyperparameters that one or several submaps have in common.
 
+    Clouds much wider than a submap are fitted in patches of about 45 x 45 m, so that the result does not
+    depend on the extent of a cloud.
+
     Parameters
     ----------
     clouds : sequence of (N, 3) array_like or Submap
@@ -93,15 +114,17 @@ def fit_hyperparameters(
     length_scale, variance, noise : float, optional
         Where the search begins: metres, metres squared (default: the elevations' own), metres.
     max_points : int or None
-        Drawn at random from each cloud; None: all. Denser points ask for a shorter length scale: their
-        errors, which neighbours share, count as terrain, for the process takes noise to be white.
+        Drawn at random from each cloud, or from each full patch of a wide one; None: all. Denser points
+        lead to a shorter length scale: the errors that neighbours share count as terrain, because the
+        process assumes white noise.
     exact : bool
-        By the likelihood of all points of a cloud at once, which takes minutes for 5000 of them; if not,
-        by that of square blocks, from any number of points (see `fit_blocks`).
+        Use the likelihood of all points of a cloud at once, which takes minutes for 5000 of them, and of
+        one patch of a wide cloud; otherwise that of square blocks, from any number of points (see
+        `fit_blocks`).
     remove_plane : bool
-        Take the best plane out of each cloud first.
+        Subtract the best plane from each cloud first.
     seed : int
-        Of the draw.
+        Seed of the random draw.
     workers : int
         Threads; the result does not depend on it.
 
@@ -113,62 +136,76 @@ def fit_hyperparameters(
     Raises
     ------
     TerrainLoopError
-        If there is no cloud, or one that is no submap.
+        If there is no cloud or one that is not a submap, or a number is impossible.
     """
     if len(clouds) == 0:
         raise TerrainLoopError(expected="at least one cloud", found="none", mend="pass a list of clouds")
-    surfaces = [surface_of(cloud, remove_plane=remove_plane) for cloud in clouds]
-    return fit_surfaces(
-        surfaces,
-        length_scale,
-        variance,
-        noise,
-        max_points=max_points,
-        exact=exact,
-        seed=seed,
-        workers=workers,
-    )
+    given = {"length_scale": length_scale, "variance": variance, "noise": noise}
+    check_positive(**given)
+    check_max_points(max_points=max_points)
+    options = FitOptions(max_points, exact, remove_plane, seed, workers)
+    return fit_training_data([detrend(cloud, remove_plane=remove_plane) for cloud in clouds], given, options)
 
 
-def fit_surfaces(
-    surfaces: Sequence[Surface],
-    length_scale: float | None = None,
-    variance: float | None = None,
-    noise: float | None = None,
+def fit_training_data(
+    data: Sequence[TrainingData],
+    given: Mapping[str, float | None],
+    options: FitOptions,
     *,
     fixed: Sequence[str] = (),
-    max_points: int | None = FIT_POINTS,
-    exact: bool = False,
-    seed: int = 0,
-    workers: int = 1,
 ) -> Hyperparameters:
-    """As `fit_hyperparameters`, those named in `fixed` keeping the value given.
+    """As `fit_hyperparameters`, from the start `given`; those named in `fixed` keep the value given."""
+    side, widest = PATCH_SIDE, max(each.side for each in data)
+    while True:
+        patches = [each.patches(side, remove_plane=options.remove_plane) for each in data]
+        with core_errors("a fit of the hyperparameters"):
+            fitted = _fit_patches(patches, given, options, fixed)
+        if fitted.length_scale * MIN_PATCH <= side or side >= widest:
+            return fitted
+        side *= 2
 
-    While all that the drawn points show is noise, or ground that changes from one to the next, four times
-    as many are drawn: on wide ground a few thousand may lie too far apart to tell its shape.
+
+def _fit_patches(
+    patches: Sequence[Sequence[TrainingData]],
+    given: Mapping[str, float | None],
+    options: FitOptions,
+    fixed: Sequence[str],
+) -> Hyperparameters:
+    """Hyperparameters of points drawn from the patches of each cloud.
+
+    The subsample is quadrupled until the fit resolves terrain (variance > 0.1 noise^2 and length scale >
+    point spacing): on wide ground a few thousand points may be too far apart.
     """
-    drawn = [surface.drawn(max_points, seed) for surface in surfaces]
-    start = drawn[0].start(length_scale, variance, noise)
-    fit = maximise_likelihood if exact else fit_blocks
-    fitted = fit(drawn, start, fixed=fixed, workers=workers)
-    spacing = min(surface.spacing for surface in drawn)
-    shows_terrain = fitted.variance > ONLY_NOISE * fitted.noise**2 and fitted.length_scale > spacing
-    if exact or shows_terrain or max_points is None or max_points >= max(len(s.xy) for s in surfaces):
+    if options.exact:
+        patches = [[max(each, key=lambda patch: len(patch.xy))] for each in patches]
+    drawn = [patch for each in patches for patch in _drawn(each, options)]
+    start = _typical(drawn[: len(patches[0])]).start(**given)
+    fit = maximise_likelihood if options.exact else fit_blocks
+    fitted = fit(drawn, start, fixed=fixed, workers=options.workers)
+    spacing = min(patch.spacing for patch in drawn)
+    shows_terrain = fitted.variance > MIN_SIGNAL * fitted.noise**2 and fitted.length_scale > spacing
+    all_drawn = sum(len(patch.xy) for each in patches for patch in each) == sum(len(d.xy) for d in drawn)
+    if options.exact or shows_terrain or options.max_points is None or all_drawn:
         return fitted
-    return fit_surfaces(
-        surfaces,
-        length_scale,
-        variance,
-        noise,
-        fixed=fixed,
-        max_points=4 * max_points,
-        seed=seed,
-        workers=workers,
-    )
+    return _fit_patches(patches, given, replace(options, max_points=4 * options.max_points), fixed)
+
+
+def _drawn(patches: Sequence[TrainingData], options: FitOptions) -> list[TrainingData]:
+    """Of each patch of a cloud, as many points as its share of a full patch's area has."""
+    if len(patches) == 1 or options.max_points is None:
+        return [patch.drawn(options.max_points, options.seed) for patch in patches]
+    shares = [patch.area(PATCH_SIDE / OCCUPANCY_CELLS) / PATCH_SIDE**2 for patch in patches]
+    counts = [max(MIN_POINTS, round(share * options.max_points)) for share in shares]
+    return [patch.drawn(count, options.seed) for patch, count in zip(patches, counts, strict=True)]
+
+
+def _typical(patches: Sequence[TrainingData]) -> TrainingData:
+    """The patch of median relief."""
+    return sorted(patches, key=lambda patch: float(patch.elevation.std()))[len(patches) // 2]
 
 
 def fit_blocks(
-    surfaces: Sequence[Surface], start: Hyperparameters, *, fixed: Sequence[str] = (), workers: int = 1
+    data: Sequence[TrainingData], start: Hyperparameters, *, fixed: Sequence[str] = (), workers: int = 1
 ) -> Hyperparameters:
     """Most likely hyperparameters from every point, square blocks of ground being taken as independent.
 
@@ -178,7 +215,7 @@ def fit_blocks(
 
     Parameters
     ----------
-    surfaces : sequence of Surface
+    data : sequence of TrainingData
         Independent draws from one prior.
     start : Hyperparameters
         Where the search begins.
@@ -187,17 +224,17 @@ def fit_blocks(
     workers : int
         Threads; the result does not depend on it.
     """
-    data = [(surface.xy, surface.elevation, surface.relative_noise) for surface in surfaces]
+    arrays = [(each.xy, each.elevation, each.relative_noise) for each in data]
     low, high = _bounds(start, fixed)
     if "length_scale" not in fixed:
-        high[0] = max(high[0], np.log(max(np.ptp(surface.xy, axis=0).max() for surface in surfaces)))
+        high[0] = max(high[0], np.log(max(np.ptp(each.xy, axis=0).max() for each in data)))
     log_parameters = np.log(astuple(start))
-    for side, work in SEARCHES:
-        for _ in range(ROUNDS):
+    for side, work in BLOCK_STAGES:
+        for _ in range(MAX_ROUNDS):
             begin = log_parameters
             length_scale, variance, noise = np.exp(begin).tolist()
             likelihood, blocks, rank, points = _core.gp_block_likelihood(
-                data,
+                arrays,
                 length_scale=length_scale,
                 variance=variance,
                 noise=noise,
@@ -206,13 +243,13 @@ def fit_blocks(
                 threads=workers,
             )
             lowest, highest = low.copy(), high.copy()
-            lowest[0], highest[0] = np.clip(begin[0] + np.log(REACH), low[0], high[0])
+            lowest[0], highest[0] = np.clip(begin[0] + np.log(TRUST_REGION), low[0], high[0])
             # About the standard errors, by the expected curvature.
             errors = 1 / np.sqrt([2 * blocks * rank, blocks * rank / 4, 2 * points])
             log_parameters = _descend(likelihood, begin, lowest, highest, errors)
             moved = log_parameters - begin
             more_detail = moved[1] - 2 * moved[2]  # of the ratio of variance and noise
-            if abs(moved[0]) < np.log(CLOSE) and more_detail < 1:
+            if abs(moved[0]) < np.log(CONVERGED_FACTOR) and more_detail < 1:
                 break
     return Hyperparameters(*np.exp(log_parameters).tolist())
 
@@ -224,7 +261,7 @@ def _descend(likelihood: Likelihood, begin: Array, low: Array, high: Array, erro
         try:
             value, gradient = likelihood(*np.exp(begin + errors * step).tolist())
         except RuntimeError:
-            return WALL, np.zeros(3)
+            return PENALTY, np.zeros(3)
         return value, errors * np.array(gradient)
 
     result = minimize(
@@ -233,7 +270,7 @@ def _descend(likelihood: Likelihood, begin: Array, low: Array, high: Array, erro
         jac=True,
         method="L-BFGS-B",
         bounds=Bounds((low - begin) / errors, (high - begin) / errors),
-        options={"ftol": 1e-9, "gtol": STANDARD_ERRORS},
+        options={"ftol": 1e-9, "gtol": GRADIENT_TOLERANCE},
     )
     moved: Array = errors * result.x
     return begin + moved
@@ -247,7 +284,7 @@ def _bounds(start: Hyperparameters, fixed: Sequence[str]) -> tuple[Array, Array]
 
 
 def maximise_likelihood(
-    surfaces: Sequence[Surface], start: Hyperparameters, *, fixed: Sequence[str] = (), workers: int = 1
+    data: Sequence[TrainingData], start: Hyperparameters, *, fixed: Sequence[str] = (), workers: int = 1
 ) -> Hyperparameters:
     """As `fit_blocks`, by the likelihood of all points of a surface at once (see `negative_log_likelihood`).
 
@@ -256,11 +293,11 @@ def maximise_likelihood(
     TerrainLoopError
         If there are more points than a dense covariance can have.
     """
-    check_size(max(len(surface.xy) for surface in surfaces))
-    count = sum(len(surface.xy) for surface in surfaces)
+    check_size(max(len(each.xy) for each in data))
+    count = sum(len(each.xy) for each in data)
 
     def per_point(log_parameters: Array) -> tuple[float, Array]:
-        terms = list(pool.map(partial(_likelihood_or_wall, log_parameters), surfaces))
+        terms = list(pool.map(partial(_likelihood_or_penalty, log_parameters), data))
         return sum(term[0] for term in terms) / count, np.sum([term[1] for term in terms], axis=0) / count
 
     with ThreadPoolExecutor(workers) as pool, threadpool_limits(1, user_api="blas"):
@@ -275,9 +312,9 @@ def maximise_likelihood(
     return Hyperparameters(*np.exp(result.x).tolist())
 
 
-def _likelihood_or_wall(log_parameters: Array, surface: Surface) -> tuple[float, Array]:
-    """The likelihood, or a wall that turns the line search back where the covariance is singular."""
+def _likelihood_or_penalty(log_parameters: Array, data: TrainingData) -> tuple[float, Array]:
+    """The likelihood, or a penalty that turns the line search back where the covariance is singular."""
     try:
-        return negative_log_likelihood(log_parameters, surface.xy, surface.elevation, surface.relative_noise)
+        return negative_log_likelihood(log_parameters, data.xy, data.elevation, data.relative_noise)
     except TerrainLoopError:
-        return WALL, np.zeros(3)
+        return PENALTY, np.zeros(3)

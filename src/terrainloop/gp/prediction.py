@@ -1,4 +1,4 @@
-"""What a Gaussian process over the elevation says about a place."""
+"""The posterior of a Gaussian process over the elevation."""
 
 from dataclasses import dataclass
 

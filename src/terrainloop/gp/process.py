@@ -1,22 +1,29 @@
-"""The elevation of a cloud as a Gaussian process: hyperparameters settled, to be asked anywhere."""
+"""The elevation of a cloud as a Gaussian process with estimated hyperparameters, evaluated anywhere."""
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp import exact, spline
-from terrainloop.gp.hyperparameters import FIT_POINTS, fit_surfaces
+from terrainloop.gp.checks import check_max_points, check_positive, core_errors
+from terrainloop.gp.grid import Grid
+from terrainloop.gp.hyperparameters import FIT_POINTS, FitOptions, fit_training_data
 from terrainloop.gp.kernel import Array, Hyperparameters
 from terrainloop.gp.prediction import Prediction
-from terrainloop.gp.surface import Surface, surface_of
-from terrainloop.submap import Submap
+from terrainloop.gp.training import Points, TrainingData, detrend
 
 Solver = Literal["spline", "exact"]
 
-MAX_LENGTH_SCALES = 4_000_000  # squares of a length scale that the points may reach over
+MAX_LENGTH_SCALES = 1_000_000  # squares of a length scale that the points may cover
+BAND = 1_000_000  # pixels to which the plane is added at once, which bounds memory
+
+# Memory of a prediction, measured (tests/test_memory.py). Spline solver: bytes per point and per cell of the
+# lattice, and the cells along an axis that are solved at once.
+POINT_BYTES, CELL_BYTES, WINDOW_CELLS = 100, 4000, 368
+EXACT_BYTES, EXACT_PIXEL_BYTES = 48, 80  # per entry of the covariance and per pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +32,8 @@ class ElevationProcess:
 
     Attributes
     ----------
-    surface : Surface
-        The points, and the plane taken out of them.
+    data : TrainingData
+        The points, and the plane subtracted from them.
     parameters : Hyperparameters
         Of the process; the noise is the typical one.
     noise : array, (N,)
@@ -42,7 +49,7 @@ class ElevationProcess:
     >>> process.predict_at([[1.0, 2.0]]).elevation  # doctest: +SKIP
     """
 
-    surface: Surface
+    data: TrainingData
     parameters: Hyperparameters
     noise: Array
     solver: Solver = "spline"
@@ -51,7 +58,7 @@ class ElevationProcess:
     @classmethod
     def from_points(
         cls,
-        points: ArrayLike | Submap,
+        points: Points,
         length_scale: float | None = None,
         variance: float | None = None,
         noise: float | ArrayLike | None = None,
@@ -64,40 +71,42 @@ class ElevationProcess:
         seed: int = 0,
         workers: int = 1,
     ) -> "ElevationProcess":
-        """Settle what is not given; the parameters are those of `GradientMap.from_points`."""
-        given_noise = None if noise is None else np.asarray(noise, dtype=np.float64)
-        each = given_noise if given_noise is not None and given_noise.ndim else None
-        surface = surface_of(points, remove_plane=remove_plane, noise=each).drawn(max_points, seed)
-        typical = surface.typical_noise
-        if typical is None and given_noise is not None:
-            typical = float(given_noise)
-        given = {"length_scale": length_scale, "variance": variance, "noise": typical}
+        """Estimate the hyperparameters that are not given; parameters as for `GradientMap.from_points`."""
+        check_max_points(max_points=max_points, fit_points=fit_points)
+        options = FitOptions(fit_points, _checked(solver) == "exact", remove_plane, seed, workers)
+        each, typical = _noise(noise)
+        with core_errors("a detrended cloud"):
+            data = detrend(points, remove_plane=remove_plane, noise=each).drawn(max_points, seed)
+        if options.exact:
+            exact.check_size(len(data.xy))
+        given = {
+            "length_scale": length_scale,
+            "variance": variance,
+            "noise": typical if each is None else data.typical_noise,
+        }
         check_positive(**given)
-        parameters = surface.start(**given)
-        _check_extent(surface, parameters.length_scale)
+        parameters = data.start(**given)
+        _check_extent(data, parameters.length_scale)
         fixed = [name for name, value in given.items() if value is not None]
         if len(fixed) < len(given):
-            parameters = fit_surfaces(
-                [surface],
-                **given,
-                fixed=fixed,
-                max_points=fit_points,
-                exact=solver == "exact",
-                seed=seed,
-                workers=workers,
-            )
-            _check_extent(surface, parameters.length_scale)
-        ratio = surface.relative_noise
-        if each is None and local_noise:
+            parameters = fit_training_data([data], given, options, fixed=fixed)
+            _check_extent(data, parameters.length_scale)
+        process = cls(data, parameters, parameters.noise * data.relative_noise, solver, options.workers)
+        return process._with_local_noise() if each is None and local_noise else process
+
+    def _with_local_noise(self) -> "ElevationProcess":
+        """With the noise scaled by the scatter around each point (see `spline.noise_ratio`)."""
+        data, fitted = self.data, self.parameters
+        with core_errors("an estimate of the local noise"):
             ratio = spline.noise_ratio(
-                surface.xy, surface.elevation, parameters.length_scale, workers=workers
+                data.xy, data.elevation, fitted.length_scale, fitted.noise, workers=self.workers
             )
-        return cls(surface, parameters, parameters.noise * ratio, solver, workers)
+        return replace(self, noise=fitted.noise * ratio)
 
     def predict_grid(
         self, origin: tuple[float, float], resolution: float, shape: tuple[int, int]
     ) -> Prediction:
-        """Posterior on the grid whose pixel (row, column) lies at origin + resolution * (column, row).
+        """Posterior on the grid whose pixel (row, column) is at origin + resolution * (column, row).
 
         Parameters
         ----------
@@ -113,73 +122,95 @@ class ElevationProcess:
         TerrainLoopError
             If the equations cannot be solved.
         """
-        surface = self.surface
-        corner = (origin[0] - surface.centre[0], origin[1] - surface.centre[1])
-        x = corner[0] + resolution * np.arange(shape[1])
-        y = corner[1] + resolution * np.arange(shape[0])
-        if self.solver == "exact":
-            field = exact.predict_grid(
-                surface.xy,
-                surface.elevation,
-                self.parameters,
-                x,
-                y,
-                noise=self.noise,
-                workers=self.workers,
-            )
-        else:
-            field = spline.predict_grid(
-                surface.xy,
-                surface.elevation,
-                self.noise,
-                self.parameters,
-                corner,
-                resolution,
-                shape,
-                workers=self.workers,
-            )
-        return _with_plane(field, surface, x, y[:, None])
+        corner = (origin[0] - self.data.centre[0], origin[1] - self.data.centre[1])
+        grid = Grid(corner, resolution, shape)
+        solver = exact if self.solver == "exact" else spline
+        with core_errors(f"a map of {shape[1]} x {shape[0]} pixels"):
+            field = solver.predict_grid(*self._training, grid, workers=self.workers)
+            rows = max(1, BAND // max(1, shape[1]))
+            for top in range(0, shape[0], rows):
+                band = Prediction(*(image[top : top + rows] for image in vars(field).values()))
+                _add_plane(band, self.data, grid.x, grid.y[top : top + rows, None])
+        return field
 
     def predict_at(self, queries: ArrayLike) -> Prediction:
-        """Posterior at places (Q, 2) in the frame of the cloud, metres; by the spline solver."""
-        places = np.asarray(queries, dtype=np.float64)
+        """Posterior at points (Q, 2) in the frame of the cloud, metres.
+
+        Raises
+        ------
+        TerrainLoopError
+            If the queries do not have that shape, or the equations cannot be solved.
+        """
+        try:
+            places = np.asarray(queries, dtype=np.float64)
+        except (ValueError, TypeError):
+            places = np.empty(0)
         if places.ndim != 2 or places.shape[1] != 2 or not np.isfinite(places).all():
             raise TerrainLoopError(
-                expected="finite places of shape (Q, 2), the columns x and y in metres",
+                expected="finite query points of shape (Q, 2), the columns x and y in metres",
                 found=f"shape {places.shape}",
-                mend="give one row a place",
+                mend="give one row per point",
             )
-        surface = self.surface
-        local = places - surface.centre[:2]
-        field = spline.predict_at(
-            surface.xy, surface.elevation, self.noise, self.parameters, local, workers=self.workers
+        local = places - self.data.centre[:2]
+        solver = exact if self.solver == "exact" else spline
+        with core_errors(f"a prediction at {len(places)} points"):
+            field = solver.predict_at(*self._training, local, workers=self.workers)
+        _add_plane(field, self.data, local[:, 0], local[:, 1])
+        return field
+
+    def memory_for(self, pixels: int) -> float:
+        """About how many bytes the prediction of so many pixels takes, the result of 20 each included."""
+        count = len(self.data.xy)
+        if self.solver == "exact":
+            return EXACT_BYTES * count**2 + EXACT_PIXEL_BYTES * pixels
+        extent = np.ptp(self.data.xy, axis=0) / (spline.KNOT_SPACING * self.parameters.length_scale)
+        cells = float(np.prod(np.clip(extent + 2 * spline.REACH_CELLS, None, WINDOW_CELLS)))
+        return POINT_BYTES * count + CELL_BYTES * cells + 20 * pixels
+
+    @property
+    def _training(self) -> tuple[Array, Array, Array, Hyperparameters]:
+        return self.data.xy, self.data.elevation, self.noise, self.parameters
+
+
+def _add_plane(field: Prediction, data: TrainingData, x: Array, y: Array) -> None:
+    """Add the removed plane back."""
+    field.elevation[...] += data.centre[2] + data.slope[0] * x + data.slope[1] * y
+    field.gradient_x[...] += data.slope[0]
+    field.gradient_y[...] += data.slope[1]
+
+
+def _noise(noise: float | ArrayLike | None) -> tuple[Array | None, float | None]:
+    """The noise of each point, if it is given so, or of all."""
+    if noise is None:
+        return None, None
+    try:
+        given = np.asarray(noise, dtype=np.float64)
+    except (ValueError, TypeError) as error:
+        raise TerrainLoopError(
+            expected="a noise in metres, one number or one for each point",
+            found=" ".join(str(error).split()),
+            mend="leave it out to have it derived",
+        ) from error
+    return (given, None) if given.ndim else (None, float(given))
+
+
+def _checked(solver: str) -> str:
+    if solver not in get_args(Solver):
+        raise TerrainLoopError(
+            expected=f"a solver out of {', '.join(get_args(Solver))}",
+            found=repr(solver),
+            mend="leave it out for 'spline'",
         )
-        return _with_plane(field, surface, local[:, 0], local[:, 1])
+    return solver
 
 
-def _with_plane(field: Prediction, surface: Surface, x: Array, y: Array) -> Prediction:
-    """Give the plane that was taken out back."""
-    field.elevation[...] += surface.centre[2] + surface.slope[0] * x + surface.slope[1] * y
-    field.gradient_x[...] += surface.slope[0]
-    field.gradient_y[...] += surface.slope[1]
-    return field
-
-
-def _check_extent(surface: Surface, length_scale: float) -> None:
-    """Refuse what would take minutes and gigabytes, most often for the sake of one stray point."""
-    squares = np.prod(np.ptp(surface.xy, axis=0) / length_scale)
-    if squares > MAX_LENGTH_SCALES:
+def _check_extent(data: TrainingData, length_scale: float) -> None:
+    """Refuse what would take minutes and gigabytes, most often because of a few stray points."""
+    with np.errstate(over="ignore"):
+        squares = np.prod(np.ptp(data.xy, axis=0) / length_scale)
+    if not squares <= MAX_LENGTH_SCALES:
         raise TerrainLoopError(
             expected=f"points over at most {MAX_LENGTH_SCALES / 1e6:.0f} million squares of a length scale",
-            found=f"{squares / 1e6:.0f} million squares of {length_scale:.3g} m: {surface.extent_in_words}",
+            found=f"{squares / 1e6:.3g} million squares of {length_scale:.3g} m: {data.extent_in_words}",
             mend="remove far outlier points, or cut the cloud into submaps",
         )
-
-
-def check_positive(**numbers: float | None) -> None:
-    """Refuse a number that is given and not positive."""
-    for name, value in numbers.items():
-        if value is not None and not 0 < value < np.inf:
-            raise TerrainLoopError(
-                expected=f"a positive {name}", found=f"{value}", mend="leave it out to have it derived"
-            )

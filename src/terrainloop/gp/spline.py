@@ -4,18 +4,21 @@ The elevation is a spline of degree 7 on knots half a length scale apart, whose 
 covariance with which the spline is the process (docs/solver.md).
 """
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrainloop import _core
 from terrainloop.errors import TerrainLoopError
+from terrainloop.gp.grid import Grid
 from terrainloop.gp.kernel import Array, Hyperparameters
 from terrainloop.gp.prediction import Prediction
 
+KNOT_SPACING = 0.5  # length scales, as in the core
+REACH_CELLS = 14  # cells of the lattice that are solved around the points at most, as in the core
 NOISE_CELL = 0.5  # length scales: the ground in a cell is near a plane
+MIN_SCATTER = 0.1  # of the noise of the process
 
 
 def predict_grid(
@@ -23,43 +26,37 @@ def predict_grid(
     elevation: Array,
     noise: Array,
     parameters: Hyperparameters,
-    origin: tuple[float, float],
-    resolution: float,
-    shape: tuple[int, int],
+    grid: Grid,
     *,
     workers: int = 1,
 ) -> Prediction:
-    """Posterior on the grid whose pixel (row, column) lies at origin + resolution * (column, row).
-
-    Parameters
-    ----------
-    xy : array, (N, 2)
-        Training points, metres.
-    elevation, noise : array, (N,)
-        Their elevations, the prior having zero mean, and the standard deviation of each, metres.
-    parameters : Hyperparameters
-        Length scale and variance; the noise is given by point.
-    origin : tuple of float
-        (x, y) of pixel (0, 0), metres.
-    resolution : float
-        Metres per pixel.
-    shape : tuple of int
-        Rows (y) and columns (x).
-    workers : int
-        Threads; the result does not depend on it.
+    """Posterior of the elevation and its gradient on a grid; parameters as for `exact.predict_grid`.
 
     Returns
     -------
     Prediction
-        float32.
+        Arrays of shape (H, W), float32.
 
     Raises
     ------
     TerrainLoopError
         If the equations cannot be solved to tolerance.
     """
-    grid = {"x": origin[0], "y": origin[1], "resolution": resolution, "rows": shape[0], "cols": shape[1]}
-    return _solve(_core.gp_predict_grid, xy, elevation, noise, parameters, threads=workers, **grid)
+    with _solver_errors(parameters):
+        maps = _core.gp_predict_grid(
+            xy,
+            elevation,
+            noise,
+            length_scale=parameters.length_scale,
+            variance=parameters.variance,
+            x=grid.origin[0],
+            y=grid.origin[1],
+            resolution=grid.resolution,
+            rows=grid.shape[0],
+            cols=grid.shape[1],
+            threads=workers,
+        )
+    return Prediction(*maps)
 
 
 def predict_at(
@@ -71,11 +68,23 @@ def predict_at(
     *,
     workers: int = 1,
 ) -> Prediction:
-    """Posterior at arbitrary places (Q, 2), metres; otherwise as `predict_grid`."""
-    return _solve(_core.gp_predict_at, xy, elevation, noise, parameters, threads=workers, queries=queries)
+    """Posterior at arbitrary points (Q, 2), metres; otherwise as `predict_grid`."""
+    with _solver_errors(parameters):
+        maps = _core.gp_predict_at(
+            xy,
+            elevation,
+            noise,
+            length_scale=parameters.length_scale,
+            variance=parameters.variance,
+            queries=queries,
+            threads=workers,
+        )
+    return Prediction(*maps)
 
 
-def noise_ratio(xy: Array, elevation: Array, length_scale: float, *, workers: int = 1) -> Array:
+def noise_ratio(
+    xy: Array, elevation: Array, length_scale: float, noise: float = 0.0, *, workers: int = 1
+) -> Array:
     """Noise of each point as a share of that of a single typical one, from the points around it.
 
     Three effects are multiplied. In cells of half a length scale the robust scatter about a plane is taken
@@ -92,29 +101,26 @@ def noise_ratio(xy: Array, elevation: Array, length_scale: float, *, workers: in
         Metres.
     length_scale : float
         Metres.
+    noise : float
+        Of the process, metres. A typical scatter below a tenth of it is taken for a tenth: on ground whose
+        elevations are quantised, most cells show none at all.
     workers : int
         Threads; the result does not depend on it.
 
     Returns
     -------
     array, (N,)
-        Where points are too sparse to tell a scatter, only the last effect is left.
+        Where points are too sparse to estimate a scatter, only the last effect is left.
     """
-    cell = NOISE_CELL * length_scale
-    return np.ravel(_core.gp_noise_ratio(xy, elevation, cell=cell, threads=workers))
+    cell, smallest = NOISE_CELL * length_scale, MIN_SCATTER * noise
+    ratio = _core.gp_noise_ratio(xy, elevation, cell=cell, smallest_scatter=smallest, threads=workers)
+    return np.ravel(ratio)
 
 
-def _solve(
-    predict: Callable[..., list[NDArray[np.float32]]],
-    xy: Array,
-    elevation: Array,
-    noise: Array,
-    parameters: Hyperparameters,
-    **places: Any,
-) -> Prediction:
-    prior = {"length_scale": parameters.length_scale, "variance": parameters.variance}
+@contextmanager
+def _solver_errors(parameters: Hyperparameters) -> Iterator[None]:
     try:
-        return Prediction(*predict(xy, elevation, noise, **prior, **places))
+        yield
     except RuntimeError as error:
         raise TerrainLoopError(
             expected="equations that can be solved in double precision",

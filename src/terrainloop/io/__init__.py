@@ -1,6 +1,6 @@
 """Files: clouds, trajectories, missions and results."""
 
-from terrainloop.io.clouds import CLOUD_SUFFIXES, read_cloud, write_cloud
+from terrainloop.io.clouds import CLOUD_SUFFIXES, read_cloud, read_crs, write_cloud
 from terrainloop.io.missions import Mission, load_mission
 from terrainloop.io.results import (
     read_loops,
@@ -16,6 +16,7 @@ __all__ = [
     "Trajectory",
     "load_mission",
     "read_cloud",
+    "read_crs",
     "read_loops",
     "read_submaps",
     "read_trajectory",

@@ -1,26 +1,39 @@
-"""Missions: folders of submaps, one cloud a file, with their odometry and truth where known."""
+"""Missions: folders of submaps, one cloud per file, with their odometry and truth where known."""
 
 import csv
 import logging
-import re
+import operator
+import os
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import overload
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.io.clouds import CLOUD_SUFFIXES, read_cloud
+from terrainloop.io.ordering import order_of_names
+from terrainloop.io.submap_poses import check_consistent, check_count, check_upright
 from terrainloop.io.trajectories import Trajectory, read_trajectory
 from terrainloop.submap import Submap
 
 logger = logging.getLogger(__name__)
 
 _SIDE_FILES = (".txt", ".csv")  # beside the clouds these hold trajectories and notes
+_SESSION_HEADERS = ("session", "pass")
+_LARGEST_TABLE = 16 << 20  # bytes
 
 
-@dataclass(frozen=True, eq=False)
+class _IndexError(TerrainLoopError, IndexError):
+    """An IndexError too, as any sequence raises it."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Mission:
     """A folder of submaps, read one by one when asked for; iterate to have those that can be read.
+
+    ``mission[0]`` and ``mission[-1]`` read one submap, ``mission[:5]`` those of the first five that can be
+    read.
 
     Attributes
     ----------
@@ -28,7 +41,7 @@ class Mission:
     files : tuple of Path
         One cloud each, in order.
     odometry, truth : Trajectory or None
-        Poses of the submaps' frames, one a file.
+        Poses of the submaps' frames, one for each file.
     """
 
     path: Path
@@ -38,6 +51,11 @@ class Mission:
 
     def __len__(self) -> int:
         return len(self.files)
+
+    def __repr__(self) -> str:
+        span = " ... ".join(dict.fromkeys([*self.names[:1], *self.names[-1:]]))
+        known = [name for name in ("odometry", "truth") if getattr(self, name) is not None]
+        return f"Mission({', '.join([str(self.path), f'{len(self)} clouds', span, *known])})"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -52,27 +70,54 @@ class Mission:
     def read(self, index: int) -> Submap:
         """The submap of one file.
 
+        Parameters
+        ----------
+        index : int
+            Negative ones count from the end.
+
         Raises
         ------
         TerrainLoopError
-            Where that file is broken.
+            Where that file is broken, or there is none (then it is an IndexError, too).
         """
+        if not -len(self) <= index < len(self):
+            raise _IndexError(
+                expected=f"an index below {len(self)}, the number of clouds in {self.path}",
+                found=str(index),
+                mend="count from 0",
+            )
+        index %= len(self)
         return read_cloud(self.files[index], self.stamp(index))
 
+    @overload
+    def __getitem__(self, index: int) -> Submap: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Submap]: ...
+    def __getitem__(self, index: int | slice) -> Submap | list[Submap]:
+        try:
+            chosen = range(len(self))[index] if isinstance(index, slice) else operator.index(index)
+        except (TypeError, ValueError) as error:
+            raise TerrainLoopError(
+                expected="an integer or a slice as the index of a mission",
+                found=f"{index!r:.60}",
+                mend="count the clouds from 0, or look a name up in Mission.names",
+            ) from error
+        return self.read(chosen) if isinstance(chosen, int) else list(self._readable(chosen))
+
     def __iter__(self) -> Iterator[Submap]:
-        broken = 0
-        for index in range(len(self)):
-            submap = self._read_if_whole(index)
-            if submap is None:
-                broken += 1
-            else:
-                yield submap
+        broken = len(self)
+        for submap in self._readable(range(len(self))):
+            broken -= 1
+            yield submap
         if broken == len(self):
             raise TerrainLoopError(
                 expected=f"clouds that can be read in {self.path}",
                 found=f"{broken} broken ones",
                 mend="see what the warnings say about each",
             )
+
+    def _readable(self, indices: range) -> Iterator[Submap]:
+        return (submap for index in indices if (submap := self._read_if_whole(index)) is not None)
 
     def _read_if_whole(self, index: int) -> Submap | None:
         try:
@@ -87,90 +132,122 @@ def load_mission(path: str | Path) -> Mission:
 
     The clouds are those in its folder ``clouds`` or, where there is none, those in the folder itself;
     there ``.txt`` and ``.csv`` files are taken for notes, never for clouds. They are ordered by file
-    name. ``odometry`` and ``truth`` are looked for as ``.tum``, then as ``.txt``.
+    name, numbers as numbers (see `terrainloop.io.ordering`). ``odometry`` and ``truth`` are looked for as
+    ``.tum``, then as ``.txt``.
 
     Raises
     ------
     TerrainLoopError
-        Where there is no folder, no cloud, no clear order, or a trajectory that does not fit.
+        Where there is no folder, no cloud, no clear order though there are poses, or a trajectory that does
+        not fit: another number of poses, frames that are not gravity-aligned, inverse poses.
     """
-    path = Path(path)
-    if not path.is_dir():
+    if not isinstance(path, str | os.PathLike) or not os.path.isdir(path):  # noqa: PTH112, which raises
         raise TerrainLoopError(
             expected="a mission folder",
-            found=f"{'a file' if path.exists() else 'nothing'} at {path}",
+            found=f"no folder at {path!s:.300}",
             mend="give the folder that holds the clouds",
         )
+    path = Path(path)
     files = _cloud_files(path)
-    _check_names(files)
-    return Mission(
-        path, files, _trajectory(path, "odometry", len(files)), _trajectory(path, "truth", len(files))
-    )
+    sources = {name: file for name in ("odometry", "truth") if (file := _side_file(path, name))}
+    trajectories = {name: read_trajectory(file) for name, file in sources.items()}
+    for name, trajectory in trajectories.items():
+        check_count(trajectory, len(files), sources[name])
+        check_upright(trajectory, sources[name])
+    order = order_of_names([file.stem for file in files], [t.stamps for t in trajectories.values()])
+    for name, trajectory in trajectories.items():
+        check_consistent(trajectory, trajectories["odometry"] if len(sources) > 1 else None, sources[name])
+    return Mission(path, tuple(files[i] for i in order), **trajectories)
 
 
-def _cloud_files(path: Path) -> tuple[Path, ...]:
+def _cloud_files(path: Path) -> list[Path]:
     inside = path / "clouds"
     folder = inside if inside.is_dir() else path
     suffixes = [s for s in CLOUD_SUFFIXES if folder == inside or s not in _SIDE_FILES]
-    files = [file for file in folder.iterdir() if file.suffix.lower() in suffixes and file.is_file()]
-    files = [file for file in files if not file.name.startswith(".")]
+    try:
+        files = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in suffixes]
+    except OSError as error:
+        raise TerrainLoopError(
+            expected=f"to read the folder {folder}", found=str(error.strerror), mend="check its permissions"
+        ) from error
+    # What is neither file nor folder, a pipe or a dangling link, counts as a broken cloud.
+    files = [file for file in files if not file.name.startswith(".") and not file.is_dir()]
     if not files:
         raise TerrainLoopError(
             expected=f"clouds ({' '.join('*' + s for s in suffixes)}) in {inside} or {path}",
             found=f"none in {folder}",
-            mend="put one cloud a submap there",
+            mend="put one cloud for each submap there",
         )
-    return tuple(sorted(files, key=lambda file: file.name))
+    _check_names(files)
+    return files
 
 
-def _check_names(files: tuple[Path, ...]) -> None:
-    """Refuse what would make a submap or the order ambiguous."""
+def _check_names(files: list[Path]) -> None:
+    """Refuse names that two files share, and those that cannot be written to a table."""
     stem, times = Counter(file.stem for file in files).most_common(1)[0]
     if times > 1:
         raise TerrainLoopError(
-            expected="one cloud a name",
+            expected="a name of its own for each cloud",
             found=f"{times} files named {stem} in {files[0].parent}",
             mend="remove or rename all but one",
         )
-    parts = [re.fullmatch(r"(\D*)(\d+)", file.stem) for file in files]
-    counters = [(part[1], int(part[2])) for part in parts if part]
-    if len(counters) == len(files) and counters != sorted(counters):
+    odd = [file.name for file in files if file.name.encode(errors="replace") != os.fsencode(file.name)]
+    if odd:
         raise TerrainLoopError(
-            expected=f"file names in {files[0].parent} whose alphabetical order is that of their numbers",
-            found=f"{files[0].name} ... {files[-1].name}",
-            mend="pad the numbers with zeros to equal length",
+            expected=f"file names in UTF-8 in {files[0].parent}", found=ascii(odd[0]), mend="rename that file"
         )
 
 
-def _trajectory(path: Path, name: str, count: int) -> Trajectory | None:
-    file = next((f for s in (".tum", ".txt") if (f := path / (name + s)).is_file()), None)
-    if file is None:
-        return None
-    trajectory = read_trajectory(file)
-    if len(trajectory) != count:
-        raise TerrainLoopError(
-            expected=f"{count} poses, one a cloud",
-            found=f"{len(trajectory)} in {file}",
-            mend="give one line a cloud, in the order of the file names",
-        )
-    return trajectory
+def _side_file(path: Path, name: str) -> Path | None:
+    """The trajectory of that name; also where it is no file, which then is refused."""
+    return next((file for s in (".tum", ".txt") if os.path.lexists(file := path / (name + s))), None)
 
 
 def read_sessions(path: Path | str) -> dict[str, str]:
-    """Session of each cloud by name, from a CSV with a header and two columns, cloud and session.
+    """Session of each cloud by name, from a CSV with a header and two columns, cloud and session (or pass).
 
     Raises
     ------
     TerrainLoopError
-        If it cannot be read as that.
+        If it cannot be read as that: other columns, a cloud named twice, an empty cell.
     """
+    path = Path(path)
+    lines = _table_lines(path)
+    number, header = lines[0] if lines else (1, [])
+    if header[:1] != ["cloud"] or header[1:] not in [[name] for name in _SESSION_HEADERS]:
+        raise _bad_sessions(path, number, f"the header {','.join(header)[:60]!r}")
+    sessions: dict[str, str] = {}
+    for number, cells in lines[1:]:
+        if len(cells) != 2 or not all(cells):
+            raise _bad_sessions(path, number, f"{','.join(cells)[:60]!r}")
+        if cells[0] in sessions:
+            raise _bad_sessions(path, number, f"{cells[0][:60]!r} a second time")
+        sessions[cells[0]] = cells[1]
+    return sessions
+
+
+def _table_lines(path: Path) -> list[tuple[int, list[str]]]:
+    """Numbers and stripped cells of the lines that are not empty."""
     try:
-        with Path(path).open(newline="", encoding="utf-8") as file:
-            rows = [row for row in csv.reader(file) if row]
-        return dict(rows[1:])
-    except (OSError, ValueError, IndexError) as error:
+        if path.exists() and not path.is_file():
+            raise OSError("not a regular file")  # a pipe would block
+        if path.stat().st_size > _LARGEST_TABLE:
+            raise OSError(f"{path.stat().st_size >> 20} MiB")
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file, strict=True)
+            return [(reader.line_num, [cell.strip() for cell in row]) for row in reader if any(row)]
+    except (OSError, ValueError, csv.Error) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise TerrainLoopError(
-            expected=f"a header and two columns, cloud and session, in {path}",
-            found=str(error),
-            mend="mend the file",
+            expected="a CSV with the columns cloud,session",
+            found=f"{path}: {reason}",
+            mend="give such a file",
         ) from error
+
+
+def _bad_sessions(path: Path, number: int, found: str) -> TerrainLoopError:
+    return TerrainLoopError(
+        expected="a header 'cloud,session' and one line for each cloud",
+        found=f"{found} in {path}, line {number}",
+        mend="correct that line",
+    )

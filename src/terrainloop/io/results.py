@@ -1,7 +1,6 @@
 """Results as CSV: loop candidates (`loops.csv`, `pairs.csv`) and the submaps they join (`submaps.csv`)."""
 
 import csv
-import os
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import fields
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import parameters_of, se3
+from terrainloop.io.files import write_whole_text
 from terrainloop.loop import LoopCandidate
 from terrainloop.record import SubmapRecord
 
@@ -171,17 +171,6 @@ _SUBMAP_ADDED: dict[str, Kind] = {"session": _TEXT}
 _SUBMAP_COLUMNS |= _SUBMAP_ADDED
 
 
-def write_whole(path: Path, write: Callable[[TextIO], object]) -> None:
-    """Write a file aside and move it into place, so that a killed run never leaves half a file."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with aside.open("w", encoding="utf-8", newline="") as file:
-            write(file)
-        aside.replace(path)
-    finally:
-        aside.unlink(missing_ok=True)
-
-
 def _written(columns: dict[str, Kind], row: Sequence[Any]) -> list[str]:
     return [write(value) for (write, _), value in zip(columns.values(), row, strict=True)]
 
@@ -192,7 +181,7 @@ def _write_table(path: Path, columns: dict[str, Kind], rows: Iterable[Sequence[A
         writer.writerow(columns)
         writer.writerows(_written(columns, row) for row in rows)
 
-    write_whole(path, write)
+    write_whole_text(path, write)
 
 
 def _read_table(path: Path, columns: dict[str, Kind], added: Collection[str]) -> Iterator[dict[str, Any]]:

@@ -1,46 +1,62 @@
 """The paper's pictures: a gradient map in the making, two maps matched, precision and recall."""
 
-from collections.abc import Mapping, Sequence
-from itertools import cycle
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import ConnectionPatch
 from numpy.typing import NDArray
 
 from terrainloop.config import Settings
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
-from terrainloop.evaluation.precision_recall import OperatingPoint
+from terrainloop.evaluation.summary import Evaluation
 from terrainloop.geometry import Array, se2, transform, yaw_of
 from terrainloop.gradient_map import GradientMap
+from terrainloop.io.files import write_whole
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.correspondences import Associations, associate
 from terrainloop.matching.overlay import Overlay
 from terrainloop.matching.ransac import get_inliers, inlier_radius_of
+from terrainloop.report import INSTALL_FIGURES
 from terrainloop.submap import Submap
+
+try:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.patches import ConnectionPatch
+except ImportError as error:
+    raise TerrainLoopError(
+        expected="matplotlib, which draws the pictures", found=str(error), mend=INSTALL_FIGURES
+    ) from error
 
 SOURCE_COLOUR, TARGET_COLOUR = "#d1495b", "#00798c"
 DRAWN_POINTS = 40_000  # more do not show at this size
+_CRITERION_STYLES = {  # thinner over thicker, where curves coincide
+    "pose": (TARGET_COLOUR, 4.0),
+    "overlap and pose": ("#edae49", 2.4),
+    "overlap": ("0.1", 0.9),
+}
 
 
-def figure_map(submap: Submap, gradient_map: GradientMap) -> Figure:
-    """How a cloud becomes a gradient map: cloud, elevation, variance, gx, magnitude (paper, Fig. 3)."""
+def figure_map(submap: Submap | None, gradient_map: GradientMap) -> Figure:
+    """How a cloud becomes a gradient map: cloud, elevation, deviation, gradients (paper, Fig. 3).
+
+    Without the cloud, the first picture shows the observed area.
+    """
     figure = Figure(figsize=(13, 7.5), layout="constrained")
+    cloud = "" if submap is None else f"{submap.name}: {len(submap):,} points, "
     figure.suptitle(
-        f"{submap.name}: {len(submap):,} points, length scale {gradient_map.parameters.length_scale:.3g} m, "
-        f"{gradient_map.resolution:.3g} m per pixel"
+        f"{cloud}length scale {gradient_map.parameters.length_scale:.3g} m, "
+        f"{gradient_map.resolution:.3g} m per pixel",
+        parse_math=False,  # here and below: names may hold dollars
     )
     first = figure.add_subplot(2, 3, 1)
-    drawn = submap.points[:: max(1, len(submap) // DRAWN_POINTS)]
-    low, high = np.percentile(drawn[:, 2], [0.5, 99.5])  # a flying pixel must not take the colours
-    heights: dict[str, Any] = {"c": drawn[:, 2], "cmap": "gist_earth", "vmin": low, "vmax": high}
-    dots = first.scatter(drawn[:, 0], drawn[:, 1], s=0.3, linewidths=0, **heights)
-    _finish(first, "(a) point cloud, height")
-    figure.colorbar(dots, ax=first, label="m")
+    if submap is None:
+        first.imshow(gradient_map.mask, origin="lower", extent=gradient_map.extent, cmap="gray", vmin=-1)
+        _finish(first, "(a) observed area")
+    else:
+        _draw_cloud(figure, first, submap)
     steep = _steepest(gradient_map)
     panels: list[tuple[str, NDArray[np.float32], str, str, dict[str, Any]]] = [
         ("(b) elevation", gradient_map.elevation, "gist_earth", "m", {}),
@@ -51,12 +67,21 @@ def figure_map(submap: Submap, gradient_map: GradientMap) -> Figure:
     ]
     for place, (title, image, colours, unit, limits) in enumerate(panels, start=2):
         axes = figure.add_subplot(2, 3, place)
-        shown = axes.imshow(image, origin="lower", extent=_extent(gradient_map), cmap=colours, **limits)
+        shown = axes.imshow(image, origin="lower", extent=gradient_map.extent, cmap=colours, **limits)
         if place > 3:
             _veil(axes, gradient_map)
         _finish(axes, title)
         figure.colorbar(shown, ax=axes, label=unit)
     return figure
+
+
+def _draw_cloud(figure: Figure, axes: Axes, submap: Submap) -> None:
+    drawn = submap.points[:: max(1, len(submap) // DRAWN_POINTS)]
+    low, high = np.percentile(drawn[:, 2], [0.5, 99.5])  # a flying pixel must not take the colours
+    heights: dict[str, Any] = {"c": drawn[:, 2], "cmap": "gist_earth", "vmin": low, "vmax": high}
+    dots = axes.scatter(drawn[:, 0], drawn[:, 1], s=0.3, linewidths=0, **heights)
+    _finish(axes, "(a) point cloud, height")
+    figure.colorbar(dots, ax=axes, label="m")
 
 
 def figure_match(source: MapEntry, target: MapEntry, candidate: LoopCandidate, settings: Settings) -> Figure:
@@ -67,7 +92,9 @@ def figure_match(source: MapEntry, target: MapEntry, candidate: LoopCandidate, s
     inliers = get_inliers(associations, T[None], inlier_radius_of(settings, target_map))[0]
     figure = Figure(figsize=(13, 11), layout="constrained")
     verdict = "loop closure" if candidate else "no loop closure"
-    figure.suptitle(f"{candidate.source} to {candidate.target}: {verdict} ({candidate.reason})")
+    figure.suptitle(
+        f"{candidate.source} to {candidate.target}: {verdict} ({candidate.reason})", parse_math=False
+    )
     grid = figure.add_gridspec(2, 2)
     left, right = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
     for axes, gradient_map, role, name in (
@@ -116,61 +143,83 @@ def figure_mission(
         axes.plot(*ends.T, color=SOURCE_COLOUR, linewidth=1.6, label=None if number else "loop closure")
     for name, pose in zip(names, poses, strict=True):
         axes.annotate(
-            name.lstrip("0") or "0", pose[:2, 3], fontsize=7, xytext=(3, 3), textcoords="offset points"
+            name.lstrip("0") or "0",
+            pose[:2, 3],
+            fontsize=7,
+            xytext=(3, 3),
+            textcoords="offset points",
+            parse_math=False,
         )
     axes.legend(loc="best")
     _finish(axes, title)
     return figure
 
 
-def figure_precision_recall(
-    points: Sequence[OperatingPoint],
-    title: str,
-    threshold: str,
-    curves: Mapping[str, Sequence[OperatingPoint]],
-) -> Figure:
-    """Precision against recall, and both against the threshold, named so (paper, Figs. 8 and 9).
+def figure_precision_recall(evaluation: Evaluation) -> Figure:
+    """Precision against recall, and both against the threshold (paper, Figs. 8 and 9), foremost by pose.
 
-    Parameters
-    ----------
-    points : sequence of OperatingPoint
-        At a few thresholds, told beside them.
-    title, threshold : str
-    curves : mapping of str to sequence of OperatingPoint
-        Each by its name, at every distinct score from high to low; drawn in steps, so that the area
-        beneath is the average precision.
+    The curves have a step at every distinct score, so that the area beneath is the average precision; the
+    cross marks the accepted loops.
     """
-    figure = Figure(figsize=(10, 4.5), layout="constrained")
+    figure = Figure(figsize=(10, 4.6), layout="constrained")
     curve, by_threshold = figure.subplots(1, 2)
-    recall, precision = [p.recall for p in points], [p.precision for p in points]
-    thresholds = [p.threshold for p in points]
-    looks = cycle([(TARGET_COLOUR, 4.0), (SOURCE_COLOUR, 2.2), ("0.1", 0.9)])  # thinner over thicker
-    for (name, steps), (colour, width) in zip(curves.items(), looks, strict=False):
-        start = [(0.0, p.precision) for p in steps[:1]]
-        drawn = np.array([*start, *((p.recall, p.precision) for p in steps)]).reshape(-1, 2)
-        curve.plot(*drawn.T, color=colour, linewidth=width, drawstyle="steps-pre", label=name)
-    curve.plot(recall, precision, "o", color=TARGET_COLOUR, markersize=4)
-    for point in points:
-        curve.annotate(f"{point.threshold:g}", (point.recall, point.precision), fontsize=7)
-    curve.set(xlabel="recall", ylabel="precision", title=title)
-    if curves:
-        curve.legend(loc="lower left", fontsize=7)
-    by_threshold.plot(thresholds, precision, "o-", color=TARGET_COLOUR, markersize=4, label="precision")
-    by_threshold.plot(thresholds, recall, "s--", color=SOURCE_COLOUR, markersize=4, label="recall")
-    by_threshold.set(xlabel=threshold, title="over the threshold")
-    by_threshold.legend()
+    true = evaluation.metrics["box", "pose"].true_pairs
+    figure.suptitle(
+        f"{len(evaluation.loops)} loops accepted, {len(evaluation.right_loops)} with the right pose; "
+        f"{true} true pairs (bounding-box IoU > {evaluation.min_overlap:g}), {evaluation.found()} found"
+    )
+    _draw_curves(curve, evaluation)
+    _draw_thresholds(by_threshold, evaluation)
     for axes in (curve, by_threshold):
         axes.set_ylim(-0.03, 1.03)
         axes.grid(alpha=0.3)
-    curve.set_xlim(-0.03, 1.03)
+        axes.legend(loc="best", fontsize=8)
     return figure
 
 
+def _draw_curves(axes: Axes, evaluation: Evaluation) -> None:
+    for name, (colour, width) in _CRITERION_STYLES.items():
+        steps = evaluation.criteria["box", name].curve()
+        drawn = [(0.0, p.precision) for p in steps[:1]] + [(p.recall, p.precision) for p in steps]
+        label = f"right by {name}: AP {evaluation.metrics['box', name].average_precision}"
+        recall, precision = np.reshape(drawn, (-1, 2)).T
+        axes.plot(recall, precision, color=colour, linewidth=width, drawstyle="steps-pre", label=label)
+    found, true = evaluation.found(), evaluation.metrics["box", "pose"].true_pairs
+    wrong = len(evaluation.loops) - len(evaluation.right_loops)
+    if true and found + wrong:
+        accepted = found / true, found / (found + wrong)
+        mark: dict[str, Any] = {
+            "color": SOURCE_COLOUR,
+            "markersize": 9,
+            "markeredgewidth": 2.2,
+            "clip_on": False,
+            "zorder": 5,
+        }
+        axes.plot(accepted[0], accepted[1], "x", label="accepted loops, by pose", **mark)
+    axes.set(xlabel="recall", ylabel="precision", xlim=(-0.03, 1.03))
+
+
+def _draw_thresholds(axes: Axes, evaluation: Evaluation) -> None:
+    thresholds = range(len(evaluation.table))  # evenly spaced, since they grow faster than linearly
+    lines: list[tuple[str, str, dict[str, Any]]] = [
+        ("pose_precision", "precision by pose", {"color": TARGET_COLOUR, "marker": "o", "linewidth": 4.0}),
+        ("pose_recall", "recall by pose", {"color": SOURCE_COLOUR, "marker": "s", "linewidth": 2.0}),
+        ("precision", "precision by overlap", {"color": "0.1", "linewidth": 0.9}),
+        ("recall", "recall by overlap", {"color": "0.1", "linewidth": 0.9, "linestyle": "--"}),
+    ]
+    for key, label, style in lines:
+        values = [row[key] for row in evaluation.table]
+        axes.plot(thresholds, values, label=label, markersize=4, **style)
+    name = f"min_{evaluation.score_name}"
+    axes.set_xticks(thresholds, [str(row[name]) for row in evaluation.table])
+    axes.set(xlabel=f"minimum {evaluation.score_name}", ylabel="precision, recall")
+
+
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a PNG; the same figure gives the same bytes."""
+    """Write a PNG, whole or not at all; the same figure gives the same bytes."""
     if path.suffix.lower() != ".png":
         raise TerrainLoopError(expected="a picture that ends in .png", found=str(path), mend="rename it")
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    write_whole(path, lambda file: figure.savefig(file, format="png", dpi=110, metadata={"Software": None}))
 
 
 def _steepest(gradient_map: GradientMap) -> float:
@@ -179,22 +228,17 @@ def _steepest(gradient_map: GradientMap) -> float:
     return (float(np.percentile(known, 99)) if known.size else 0.0) or 1.0
 
 
-def _extent(gradient_map: GradientMap) -> tuple[float, float, float, float]:
-    (x, y), r, (rows, columns) = gradient_map.origin, gradient_map.resolution, gradient_map.mask.shape
-    return x - r / 2, x + r * (columns - 0.5), y - r / 2, y + r * (rows - 0.5)
-
-
 def _veil(axes: Axes, gradient_map: GradientMap) -> None:
     """Cover the ground that is not known with white."""
     veil = np.ones((*gradient_map.mask.shape, 4))
     veil[..., 3] = np.where(gradient_map.mask, 0.0, 0.85)
-    axes.imshow(veil, origin="lower", extent=_extent(gradient_map))
+    axes.imshow(veil, origin="lower", extent=gradient_map.extent)
 
 
 def _show_magnitude(axes: Axes, gradient_map: GradientMap) -> None:
     steep = _steepest(gradient_map)
     axes.imshow(
-        gradient_map.magnitude, origin="lower", extent=_extent(gradient_map), cmap="gray", vmin=0, vmax=steep
+        gradient_map.magnitude, origin="lower", extent=gradient_map.extent, cmap="gray", vmin=0, vmax=steep
     )
     _veil(axes, gradient_map)
 
@@ -225,7 +269,7 @@ def _show_overlay(axes: Axes, overlay: Overlay) -> None:
     image = np.ones((*overlay.shared.shape, 3))
     image[overlay.shared, 0] = np.clip(overlay.of_source(overlay.source.magnitude) / steep, 0, 1)
     image[overlay.shared, 1:] = np.clip(overlay.of_target(target.magnitude) / steep, 0, 1)[:, None]
-    axes.imshow(image, origin="lower", extent=_extent(target))
+    axes.imshow(image, origin="lower", extent=target.extent)
     _finish(axes, "aligned overlap: grey agrees, red source only, cyan target only")
 
 
@@ -243,5 +287,5 @@ def _show_both(axes: Axes, source_map: GradientMap, target_map: GradientMap, T_p
 
 
 def _finish(axes: Axes, title: str) -> None:
-    axes.set(title=title, xlabel="x, m", ylabel="y, m", aspect="equal")
-    axes.title.set_fontsize(10)
+    axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    axes.set_title(title, fontsize=10, parse_math=False)

@@ -1,5 +1,6 @@
 """Missions of a simulated rover: submaps, odometry and truth, in memory or as a mission folder."""
 
+import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -12,14 +13,21 @@ from numpy.typing import NDArray
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import se3, transform
-from terrainloop.io.clouds import write_cloud
+from terrainloop.io.clouds import CLOUD_SUFFIXES, write_cloud
+from terrainloop.io.files import write_whole_text
+from terrainloop.io.staging import errors_naming, publish, staging
 from terrainloop.io.trajectories import Trajectory, write_tum
 from terrainloop.simulation.odometry import Drift, estimate, true_poses
 from terrainloop.simulation.paths import revisiting_path
 from terrainloop.simulation.sensors import SpinningLidar, StereoCamera
 from terrainloop.simulation.terrain import Terrain, make_terrain
+from terrainloop.strict_yaml import read_yaml
 
 Array = NDArray[np.float64]
+
+_DESCRIPTION = "simulation.yaml"
+_TRAJECTORIES = ("odometry.tum", "truth.tum")
+_CLOUDS_ONLY = set(CLOUD_SUFFIXES) - {".txt", ".csv"}  # which beside the folder of clouds are notes
 
 
 @dataclass(frozen=True)
@@ -229,16 +237,67 @@ def thin(points: Array, voxel: float) -> Array:
 def write_mission(mission: SimulatedMission, path: FilePath | str) -> None:
     """Write a mission folder: ``clouds/*.ply``, ``odometry.tum``, ``truth.tum``, ``simulation.yaml``.
 
-    The first column of the trajectories is the index of the submap.
+    The first column of the trajectories is the index of the submap. All of it is written or nothing. What an
+    earlier run wrote there is replaced; other files are left alone.
+
+    Raises
+    ------
+    TerrainLoopError
+        If the folder holds a mission that is not simulated (see `written_before`).
+    OSError
+        Naming the folder, where it cannot be written.
     """
     folder = FilePath(path)
-    (folder / "clouds").mkdir(parents=True, exist_ok=True)
-    for i, cloud in enumerate(mission.clouds):
-        write_cloud(folder / "clouds" / f"{i:06d}.ply", cloud)
+    stale = [file.relative_to(folder) for file in written_before(folder)]
+    clouds = [f"clouds/{i:06d}.ply" for i in range(len(mission.clouds))]
     stamps = np.arange(len(mission.clouds), dtype=float)
-    write_tum(folder / "odometry.tum", Trajectory(stamps, mission.odometry))
-    write_tum(folder / "truth.tum", Trajectory(stamps, mission.truth))
-    (folder / "simulation.yaml").write_text(yaml.safe_dump(_description(mission), sort_keys=False))
+    with staging(folder) as aside, errors_naming(folder):
+        (aside / "clouds").mkdir()
+        for name, cloud in zip(clouds, mission.clouds, strict=True):
+            write_cloud(aside / name, cloud)
+        for name, poses in zip(_TRAJECTORIES, (mission.odometry, mission.truth), strict=True):
+            write_tum(aside / name, Trajectory(stamps, poses))
+        description = yaml.safe_dump(_description(mission), sort_keys=False)
+        write_whole_text(aside / _DESCRIPTION, lambda file: file.write(description))
+        publish(aside, folder, [*clouds, *_TRAJECTORIES, _DESCRIPTION], stale)
+
+
+def written_before(path: FilePath | str) -> list[FilePath]:
+    """Clouds and trajectories that an earlier `write_mission` wrote to a folder; none if there is no folder.
+
+    Raises
+    ------
+    TerrainLoopError
+        If the folder holds other clouds, or trajectories without a ``simulation.yaml``.
+    """
+    folder = FilePath(path)
+    count = _submaps_of(folder / _DESCRIPTION)
+    clouds = [file for file in (folder / "clouds").glob("*") if file.suffix.lower() in CLOUD_SUFFIXES]
+    ours = [file for file in clouds if re.fullmatch(r"\d{6}\.ply", file.name) and int(file.stem) < count]
+    others = set(clouds) - set(ours)
+    trajectories = [file for name in _TRAJECTORIES if (file := folder / name).exists()]
+    if count == 0:
+        others |= {*trajectories, *(file for file in folder.glob("*") if file.suffix.lower() in _CLOUDS_ONLY)}
+    if others:
+        raise TerrainLoopError(
+            expected="a folder without a mission, or with one that was simulated",
+            found=f"{min(others)}, which 'terrainloop simulate' did not write",
+            mend="name another folder",
+        )
+    return [*trajectories, *ours]
+
+
+def _submaps_of(description: FilePath) -> int:
+    """How many clouds go with a description of ours; none where there is no such file."""
+    try:
+        content = read_yaml(description)
+    except TerrainLoopError:
+        return 0
+    ours = (
+        isinstance(content, dict)
+        and {"world", "seed", "submaps", "sensor", "setup", "legs"} <= content.keys()
+    )
+    return content["submaps"] if ours and type(content["submaps"]) is int else 0
 
 
 def _description(mission: SimulatedMission) -> dict[str, object]:

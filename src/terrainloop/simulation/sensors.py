@@ -130,21 +130,23 @@ class StereoCamera:
 
     def observe(self, terrain: Terrain, T_world_sensor: Array, rng: Generator) -> Array:
         """Points (N, 3) that the matcher yields, in the sensor frame (x along the optical axis)."""
-        pixels = self._pixels()
+        columns = np.arange(0, self.width, self.column_step)
+        pixels = self.directions(np.arange(self.height), columns)
         depth = self._true_depth(terrain, T_world_sensor, pixels, rng)
         true_disparity = self.focal_length * self.baseline / depth
         disparity = _flying_pixels(true_disparity, rng) + self._disparity_error(true_disparity, rng)
         measured = self.focal_length * self.baseline / np.maximum(disparity, 0.1)
         # What the left image shows at a column less than the disparity lies outside the right image.
-        unseen = np.arange(0, self.width, self.column_step) < true_disparity
+        unseen = columns < true_disparity
         kept = ~unseen & (measured <= self.max_range) & ~self._blank_areas(rng)
         return measured[kept][:, None] * pixels[kept]
 
-    def _pixels(self) -> Array:
-        """Direction (rows, columns, 3) of each cast pixel, with unit depth."""
-        u = np.arange(0, self.width, self.column_step) - 0.5 * (self.width - 1)
-        v = np.arange(self.height) - 0.5 * (self.height - 1)
-        right, down = np.meshgrid(u / self.focal_length, v / self.focal_length)
+    def directions(self, rows: NDArray[np.int_], columns: NDArray[np.int_]) -> Array:
+        """Directions (len(rows), len(columns), 3) of pixels in the sensor frame, with unit depth."""
+        right, down = np.meshgrid(
+            (columns - 0.5 * (self.width - 1)) / self.focal_length,
+            (rows - 0.5 * (self.height - 1)) / self.focal_length,
+        )
         return np.stack([np.ones_like(right), -right, -down], axis=-1)
 
     def _true_depth(self, terrain: Terrain, T_world_sensor: Array, pixels: Array, rng: Generator) -> Array:

@@ -1,0 +1,1 @@
+"""Rendered images and point colours of simulated missions, for the baselines that need them."""

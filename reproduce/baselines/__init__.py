@@ -1,0 +1,1 @@
+"""The baselines and our own pipeline behind one interface, `method`: one file per method."""
