@@ -15,8 +15,9 @@ from scipy.stats import chi2
 from terrainloop.config import Calibration, Settings
 from terrainloop.detection.detector import map_submap
 from terrainloop.entry import MapEntry
-from terrainloop.evaluation.judge import judge
 from terrainloop.evaluation.overlap import box_iou, world_boxes
+from terrainloop.evaluation.pairs import evaluate_pairs
+from terrainloop.evaluation.truth import GroundTruth
 from terrainloop.field import field_of, field_spacing
 from terrainloop.geometry import inverse, parameters_of, se2, yaw_of
 from terrainloop.gp.kernel import Hyperparameters
@@ -186,20 +187,21 @@ def of_revisits(settings, most=1.0):
 
     Of those that share up to `most`.
     """
-    judged = []
+    evaluated = []
     for name in DRIFTING:
         drive = Drive.of(name)
         pairs = searches_of_revisits(name, most, search_settings(settings))
-        judged += judge(decided(pairs, settings), [entry.record for entry in drive.entries], drive.truth)
-    much = np.array([pair.overlap > 0.3 for pair in judged])
+        truth = GroundTruth([entry.record for entry in drive.entries], drive.truth)
+        evaluated += evaluate_pairs(decided(pairs, settings), truth)
+    much = np.array([pair.overlap > 0.3 for pair in evaluated])
     loop, right = (
         np.array(values)
-        for values in zip(*((bool(p.candidate), p.pose_is_right) for p in judged), strict=True)
+        for values in zip(*((bool(p.candidate), p.pose_is_right) for p in evaluated), strict=True)
     )
-    score = np.array([max(pair.candidate.score, 0.0) for pair in judged])
+    score = np.array([max(pair.candidate.score, 0.0) for pair in evaluated])
     measured = {
         "wrong loops": np.sum(loop & ~right),
-        "revisits called ambiguous": sum("ambiguous" in pair.candidate.reason for pair in judged),
+        "revisits called ambiguous": sum("ambiguous" in pair.candidate.reason for pair in evaluated),
     }
     for name, band in (("above 30 %", much), ("at 10-30 %", ~much)):
         if band.any():
