@@ -112,6 +112,23 @@ def map_of(height_and_slope, T_planar=None, *, origin=(-2.0, -2.5), shape=(60, 5
     )
 
 
+def flat(xy):
+    return 0.1 * xy[:, 0], np.full(xy.shape, (0.1, 0.0))
+
+
+def ridges(seed):
+    """Crests along y of many sizes: x is plain to see, y is not."""
+    rng = np.random.default_rng(seed)
+    centres, sizes, heights = rng.uniform(-9, 9, 60), rng.uniform(0.2, 0.5, 60), rng.normal(0, 0.12, 60)
+
+    def ground(xy):
+        offset = xy[:, :1] - centres
+        bumps = heights * np.exp(-0.5 * (offset / sizes) ** 2)
+        return bumps.sum(1), np.c_[-(offset / sizes**2 * bumps).sum(1), 0 * xy[:, 0]]
+
+    return ground
+
+
 @pytest.fixture(scope="session")
 def world():
     """Worlds by seed: ``world(0)``."""

@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from conftest import STRICT, map_of, with_match
+from conftest import STRICT, flat, map_of, ridges, with_match
 from scipy.stats import beta, binom
 
 from terrainloop.config import Calibration
@@ -325,10 +325,6 @@ def test_chance_is_reckoned_for_all_pairs(world):
         assert told == pytest.approx(pairs * 10**-candidate.score, rel=0.06)
 
 
-def flat(xy):
-    return 0.1 * xy[:, 0], np.full(xy.shape, (0.1, 0.0))
-
-
 def ripples(xy):
     k = 2 * np.pi / 0.9
     return 0.1 * np.sin(k * xy[:, 0]), np.c_[0.1 * k * np.cos(k * xy[:, 0]), 0 * xy[:, 0]]
@@ -338,19 +334,6 @@ def egg_box(xy):
     k = 2 * np.pi / 0.9
     x, y = k * xy.T
     return 0.1 * np.sin(x) * np.sin(y), 0.1 * k * np.c_[np.cos(x) * np.sin(y), np.sin(x) * np.cos(y)]
-
-
-def ridges(seed):
-    """Crests along y of many sizes: x is plain to see, y is not."""
-    rng = np.random.default_rng(seed)
-    centres, sizes, heights = rng.uniform(-9, 9, 60), rng.uniform(0.2, 0.5, 60), rng.normal(0, 0.12, 60)
-
-    def ground(xy):
-        offset = xy[:, :1] - centres
-        bumps = heights * np.exp(-0.5 * (offset / sizes) ** 2)
-        return bumps.sum(1), np.c_[-(offset / sizes**2 * bumps).sum(1), 0 * xy[:, 0]]
-
-    return ground
 
 
 @pytest.mark.parametrize(
