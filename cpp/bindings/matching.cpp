@@ -77,7 +77,7 @@ auto turn(const AnyArray& x, const AnyArray& y, const AnyArray& known, const Dou
   const Lookup to = affine(lookup);
   const std::size_t height = rows, width = cols;
   std::vector<float> turned(3 * height * width);
-  // Too short to be worth giving up Python's lock, which another thread would take for longer.
+  // Too short to be worth releasing Python's lock, which another thread would hold for longer.
   turn_field(images[0], images[1], images[2], to, rows, cols, turned.data());
   return to_numpy(std::move(turned), {3, height, width});
 }

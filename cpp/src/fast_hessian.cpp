@@ -7,7 +7,7 @@
 namespace terrainloop::surf {
 namespace {
 
-constexpr double kSigmaPerFilterSize = 1.2 / 9.0;  // section 3.3: the 9 x 9 filter stands for sigma = 1.2
+constexpr double kSigmaPerFilterSize = 1.2 / 9.0;  // section 3.3: the 9 x 9 filter approximates sigma = 1.2
 constexpr double kDxyWeight = 0.9;                 // section 3.2, equation 3
 
 struct Hessian {
@@ -98,7 +98,7 @@ struct Neighbourhood {
 };
 
 /// Keypoint at the peak of the quadratic through the neighbourhood (section 3.4; Brown & Lowe, BMVC 2002).
-/// None where the peak lies beyond the neighbours: the fit does not hold there.
+/// None where the peak is beyond the neighbours: the fit is not valid there.
 std::optional<Keypoint> refine(const IntegralImage& integral, const Neighbourhood& sample) {
   const Eigen::Vector3d gradient = sample.gradient();
   const Eigen::Vector3d offset = -sample.curvature().fullPivLu().solve(gradient);

@@ -24,7 +24,7 @@ class IntegralImage {
   int rows() const { return rows_; }
   int cols() const { return cols_; }
 
-  /// Sum over the pixels of rows [row0, row1) and columns [col0, col1), which must lie in the image.
+  /// Sum over the pixels of rows [row0, row1) and columns [col0, col1), which must be within the image.
   double box(int row0, int col0, int row1, int col1) const {
     return sums_[index(row1, col1)] - sums_[index(row0, col1)] - sums_[index(row1, col0)] +
            sums_[index(row0, col0)];

@@ -44,7 +44,7 @@ double corner(const IntegralImage& integral, Bound y, Bound x) {
 }
 
 /// Haar wavelet responses at (x, y), positive where the image grows with x and with y; 0 where the wavelet
-/// reaches over the border. Bounds are not rounded to pixels, which would bias wavelets of even side.
+/// extends over the border. Bounds are not rounded to pixels, which would bias wavelets of even side.
 Response haar(const IntegralImage& integral, double x, double y, double side) {
   const double half = 0.5 * side;
   const int rows = integral.rows(), cols = integral.cols();
@@ -86,7 +86,7 @@ std::vector<Directed> responses_around(const IntegralImage& integral, double x, 
   return responses;
 }
 
-/// Sum of the responses whose angles lie in the window that starts at the first-th.
+/// Sum of the responses whose angles are in the window that starts at the first-th.
 Response window_sum(const std::vector<Directed>& responses, std::size_t first) {
   Response sum;
   for (std::size_t n = 0; n < responses.size(); ++n) {

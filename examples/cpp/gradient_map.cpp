@@ -32,7 +32,7 @@ int main(int argc, char** argv) try {
   }
   const std::size_t count = elevation.size();
   if (count == 0) {
-    std::cerr << argv[1] << " holds no points: x y z, one a line\n";
+    std::cerr << argv[1] << " holds no points: x y z, one per line\n";
     return 1;
   }
 

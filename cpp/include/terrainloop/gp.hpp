@@ -21,13 +21,13 @@ struct Points {
   std::size_t count;
 };
 
-/// Pixel (row, col) lies at (x + resolution * col, y + resolution * row).
+/// Pixel (row, col) is at (x + resolution * col, y + resolution * row).
 struct Grid {
   double x, y, resolution;  ///< metres
   int rows, cols;
 };
 
-/// Where the posterior goes, row-major (rows, cols) or (count); each may be null and is then not computed.
+/// Output of the posterior, row-major (rows, cols) or (count); each may be null and is then not computed.
 struct Maps {
   float* elevation;
   float* gradient_x;
@@ -36,10 +36,10 @@ struct Maps {
   float* gradient_variance;  ///< mean of the variances of the two components of the gradient
 };
 
-/// Posterior on a grid, with at most `threads` threads in all: no more than the machine runs at once, and as
-/// few as it lets start. The bytes do not depend on their number.
-/// Memory, beside the arguments: 48 bytes a point and at most 0.7 GB, whatever the area.
-/// Throws std::invalid_argument for numbers that make no model, std::runtime_error where the equations
+/// Posterior on a grid, with at most `threads` threads: no more than there are processors, and fewer if the
+/// system refuses to start them. The result does not depend on their number, to the byte.
+/// Memory, besides the arguments: 48 bytes per point and at most 0.7 GB, whatever the area.
+/// Throws std::invalid_argument for numbers that do not define a model, std::runtime_error if the equations
 /// cannot be solved to tolerance.
 void predict_grid(const Points& points, const Hyperparameters& parameters, const Grid& grid, const Maps& maps,
                   int threads = 1);
@@ -53,13 +53,13 @@ void predict_at(const Points& points, const Hyperparameters& parameters, const d
 /// In square cells of side `cell` (metres; half a length scale, so that the ground in one is near a plane)
 /// the robust scatter about a plane is taken and pooled with that of the cells around; where it grows, as
 /// that of stereo does with the range, so does the ratio. Points further from their cell's plane than three
-/// standard deviations have it raised by the square of the excess, so that flying pixels raise no spikes. The
+/// standard deviations have it raised by the square of the excess, so that flying pixels cause no spikes. The
 /// n points in a square of half that side have it raised by sqrt(n), so that they count as one: the errors of
-/// neighbours are much the same, and do not average out. Where the points are too sparse to show a scatter,
-/// only the last is left. A typical scatter below `smallest_scatter` (metres) is taken for that: on quantised
-/// elevations most cells have none. `ratio` is (count). Memory grows with the points, whatever the area.
-/// Throws std::invalid_argument for numbers that are not finite and for points over more than a million cells
-/// along an axis.
+/// neighbours are correlated and do not average out. Where the points are too sparse to estimate a scatter,
+/// only the last effect remains. A typical scatter below `smallest_scatter` (metres) counts as that value: on
+/// quantised elevations most cells have none. `ratio` is (count). Memory grows with the points, whatever the
+/// area. Throws std::invalid_argument for numbers that are not finite and for points over more than a million
+/// cells along an axis.
 void noise_ratio(const double* xy, const double* elevation, std::size_t count, double cell,
                  double smallest_scatter, double* ratio, int threads = 1);
 

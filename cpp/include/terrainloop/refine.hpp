@@ -8,7 +8,7 @@
 
 namespace terrainloop::refine {
 
-/// Gradients on a grid whose pixel (row, col) lies at (x, y) + resolution * (col, row), metres.
+/// Gradients on a grid whose pixel (row, col) is at (x, y) + resolution * (col, row), metres.
 struct Gradients {
   ImageView<float> x, y, variance;
   ImageView<std::uint8_t> mask;
@@ -36,11 +36,11 @@ struct Linearised {
   std::vector<double> weights;   ///< 2 x N
   std::vector<double>
       by_motion;  ///< 2 x N x 5: x, y, rotation about the pivot, difference in slope along x and y
-  std::vector<double> by_strain;  ///< 2 x N x 3: along x, along y, across
+  std::vector<double> by_strain;  ///< 2 x N x 3: along x, along y, shear
 };
 
-/// Refines a motion on the gradients, by Gauss-Newton with Cauchy's weights; nothing where the maps share too
-/// little ground. Throws std::invalid_argument for images of different shapes, impossible numbers, and where
+/// Refines a motion on the gradients, by Gauss-Newton with Cauchy's weights; empty if the overlap of the maps
+/// is too small. Throws std::invalid_argument for images of different shapes, impossible numbers, and where
 /// a masked gradient is not finite or its variance not positive.
 std::optional<Linearised> settle(const Gradients& source, const Gradients& target, const Motion& motion,
                                  const Settings& settings);

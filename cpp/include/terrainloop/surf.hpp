@@ -12,9 +12,9 @@
 namespace terrainloop::surf {
 
 struct Keypoint {
-  double x;            ///< column, pixels, to a fraction of a pixel
-  double y;            ///< row, pixels
-  double scale;        ///< s of the publication, pixels: the sigma of the Gaussian that the filters stand for
+  double x;      ///< column, pixels, to a fraction of a pixel
+  double y;      ///< row, pixels
+  double scale;  ///< s of the publication, pixels: the sigma of the Gaussian that the filters approximate
   double orientation;  ///< angle of the direction (d col, d row), radians in (-pi, pi]
   double response;     ///< determinant of the Hessian, filters divided by their area: image units squared
   int laplacian;       ///< +1 for a dark blob on bright ground, -1 for a bright blob on dark ground
@@ -35,13 +35,13 @@ struct Features {
 };
 
 /// Keypoints of an image and their descriptors. Keypoints are at the pixels where mask is not 0; a mask
-/// without data allows all. There is no keypoint where a filter that is needed reaches over the border.
+/// without data allows all. There are no keypoints where a required filter extends over the border.
 /// Throws std::invalid_argument for an image that is not finite, a mask of another shape, and impossible
 /// settings.
 Features extract(ImageView<float> image, ImageView<std::uint8_t> mask, const Settings& settings);
 
 /// Response map (rows x cols) of one box filter of odd lobe size: filter_size = 9, 15, 21, ... pixels; 0
-/// where the filter reaches over the border. Throws std::invalid_argument for other sizes.
+/// where the filter extends over the border. Throws std::invalid_argument for other sizes.
 std::vector<double> fast_hessian(ImageView<float> image, int filter_size);
 
 }  // namespace terrainloop::surf

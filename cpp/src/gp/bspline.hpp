@@ -6,7 +6,7 @@
 namespace terrainloop::gp {
 
 constexpr int kDegree = 7;
-constexpr int kSupport = kDegree + 1;  ///< basis functions that are not zero on a cell
+constexpr int kSupport = kDegree + 1;  ///< basis functions that are nonzero on a cell
 
 using BasisRow = std::array<double, kSupport>;
 
@@ -14,8 +14,8 @@ struct Basis {
   BasisRow value, slope;
 };
 
-/// Coefficients [power][function] of the polynomials that the functions are on a cell, from the leftmost
-/// on, by the recursion of Cox and de Boor.
+/// Coefficients [power][function] of the functions as polynomials on a cell, from the leftmost on, by the
+/// recursion of Cox and de Boor.
 constexpr std::array<BasisRow, kSupport> basis_coefficients() {
   std::array<BasisRow, kSupport> c{}, lower{};
   c[0][0] = 1.0;
@@ -33,7 +33,7 @@ constexpr std::array<BasisRow, kSupport> basis_coefficients() {
   return c;
 }
 
-/// The functions that are not zero on a cell at t within [0, 1] of it; slopes are per unit of the lattice.
+/// The functions that are nonzero on a cell, at t within [0, 1] of it; slopes are per unit of the lattice.
 inline Basis basis_at(double t) {
   static constexpr std::array<BasisRow, kSupport> c = basis_coefficients();
   Basis basis{c[kDegree], {}};

@@ -5,7 +5,7 @@
 
 #include "terrainloop/gp.hpp"
 
-/// What every public function refuses.
+/// Checks that all public functions share.
 namespace terrainloop::gp {
 
 inline bool positive(double value) { return value > 0.0 && std::isfinite(value); }
@@ -14,7 +14,7 @@ inline void check_threads(int threads) {
   if (threads < 1) throw std::invalid_argument("threads must be >= 1");
 }
 
-/// Coordinates are bounded so that their squares are numbers, too.
+/// Coordinates are bounded so that their squares are finite, too.
 inline void check_positions(const double* xy, const double* elevation, std::size_t count) {
   const auto bounded = [](double coordinate) { return std::abs(coordinate) < 1e100; };
   if (count == 0) throw std::invalid_argument("there must be at least one point");

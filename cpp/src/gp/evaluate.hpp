@@ -5,10 +5,10 @@
 
 #include "subdomain.hpp"
 
-/// Sums of B-splines, times weights or their covariance, at places that form a grid.
+/// Sums of B-splines, times weights or their covariance, at queries that form a grid.
 namespace terrainloop::gp {
 
-/// One coordinate of the places to evaluate at.
+/// One coordinate of the queries.
 struct Sample {
   int cell;   ///< of the lattice
   int index;  ///< in the output
@@ -16,7 +16,7 @@ struct Sample {
   std::array<float, kSupport * kSupport> values, slopes;  ///< products of pairs, by the first and the offset
 };
 
-/// The place at t within [0, 1] of a cell.
+/// The query at t within [0, 1] of a cell.
 Sample sample_at(int cell, double t, int index);
 
 struct Span {
@@ -32,7 +32,7 @@ void evaluate_mean(const RowMatrix& weights, double spacing, Span rows, Span col
 /// Variances of the spline on the cells of a subdomain.
 class VarianceField {
  public:
-  /// From what Subdomain::factorise gives; no variance is given as less than `smallest`, metres squared.
+  /// From the result of Subdomain::factorise; variances are at least `smallest`, metres squared.
   VarianceField(const Eigen::MatrixXf& covariance, const Subdomain& subdomain, double spacing,
                 double smallest);
   void evaluate(Span rows, Span cols, const Maps& maps, int stride) const;

@@ -20,7 +20,7 @@ using Vector = Eigen::VectorXd;
 constexpr int kDegrees = 28;  // of the polynomials that the components along an axis are made of
 constexpr int kMoments = 2 * kDegrees - 1;  // degrees of a product of two
 constexpr int kNodes = 2 * kDegrees;        // of Gauss' quadrature, exact for products of four
-constexpr double kLeftOut = 0.1;   // nats: twice what a block's points may say of the components left out
+constexpr double kLeftOut = 0.1;   // nats: twice what a block's points may contribute by components left out
 constexpr double kJitter = 1e-11;  // variance of every component, as a share of the prior's
 constexpr double kSpread[] = {0.75487766624669, 0.56984029099805};  // multiples fill the unit square evenly
 constexpr std::size_t kChunk = 256;                                 // points at once
@@ -60,12 +60,12 @@ struct Quadrature {
   }
 };
 
-/// The leading components of the prior on a block of unit side: products of one along y and one along x.
+/// The leading components of the prior on a block with unit sides: products of one along y and one along x.
 struct Components {
   Matrix basis;                 ///< (degrees, p) of those along an axis, by polynomials
   std::vector<int> in_y, in_x;  ///< (r) of each product
 
-  /// As many as leave `rest` of the variance out, by the eigenvectors of the covariance.
+  /// The components that leave out `rest` of the variance, by the eigenvectors of the covariance.
   Components(const Matrix& covariance, double rest) {
     const Eigen::SelfAdjointEigenSolver<Matrix> solver(covariance);
     const Vector shares = solver.eigenvalues().reverse();
@@ -93,7 +93,7 @@ struct Components {
   }
 };
 
-/// Place of the pair {i, j} in a list of all.
+/// Index of the pair {i, j} in a list of all.
 int pair(int i, int j) { return i < j ? pair(j, i) : i * (i + 1) / 2 + j; }
 
 /// Twice the lower triangle, but once the diagonal: with another's lower triangle it gives tr(A B).
@@ -103,12 +103,12 @@ Matrix folded(const Matrix& symmetric) {
   return result;
 }
 
-/// Points of a surface on a block whose middle is (x, y).
+/// Points of a surface on a block centred on (x, y).
 struct Patch {
   const Points* surface;
   std::vector<std::size_t> points;
   double x, y;
-  double turn;  ///< in [0, 1), even over the ground: those below a share make an even part
+  double turn;  ///< in [0, 1), evenly distributed over the ground: those below a share are an even subset
 };
 
 /// Blocks of a grid over the middle of a surface, without those that hold no point.
@@ -141,7 +141,8 @@ void cut(const Points& surface, double side, std::vector<Patch>& patches) {
   }
 }
 
-/// What the points of a block say: phi' W phi, phi' W z, z' W z, sum log omega^2, with W = diag(1 / omega^2).
+/// Sufficient statistics of the points of a block: phi' W phi, phi' W z, z' W z, sum log omega^2, with W =
+/// diag(1 / omega^2).
 struct Block {
   Matrix information;
   Vector vector;

@@ -14,13 +14,13 @@ namespace terrainloop::gp {
 namespace {
 
 constexpr int kPatches = 2;         // to a side of a cell: points of one patch share their error
-constexpr std::size_t kFewest = 8;  // points that tell the scatter in a cell
+constexpr std::size_t kFewest = 8;  // points needed to estimate the scatter in a cell
 constexpr double kEnough = 0.2;     // share of the points in such cells, below which the noise stays constant
 constexpr int kRefits = 3;
 constexpr double kPooling = 2.0;   // standard deviation of the weights of neighbouring cells, in cells
 constexpr int kFarthest = 6;       // cells that are pooled, on each side
-constexpr double kSmallest = 0.3;  // of the typical noise: no ground is known much better than the rest
-constexpr double kLargest = 1e50;  // nor anything so badly that it is no number
+constexpr double kSmallest = 0.3;  // of the typical noise: no ground is measured much better than the rest
+constexpr double kLargest = 1e50;  // bound that keeps the ratio finite
 constexpr double kOutlier = 3.0;   // standard deviations from which a point counts as an outlier
 
 double median(std::vector<double>& values) {
@@ -29,7 +29,7 @@ double median(std::vector<double>& values) {
   return *middle;
 }
 
-/// Distances of some points from the plane that most of them lie on, and their robust standard deviation.
+/// Distances of some points from the plane through most of them, and their robust standard deviation.
 double scatter(const double* xy, const double* elevation, const std::size_t* begin, const std::size_t* end,
                double side, double* residuals) {
   const auto count = static_cast<std::size_t>(end - begin);

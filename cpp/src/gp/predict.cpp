@@ -40,7 +40,7 @@ void check(const Points& points, const Hyperparameters& parameters, int threads)
   check_points(points);
 }
 
-/// Cells over the ground that is asked for, as far as the points reach.
+/// Cells over the queried ground, as far as the points reach.
 Lattice cover(const Points& points, const Box queries[2], double spacing) {
   Box ground[2];
   for (std::size_t i = 0; i < points.count; ++i)
@@ -62,7 +62,7 @@ Lattice cover(const Points& points, const Box queries[2], double spacing) {
   return {origin[0], origin[1], spacing, cells[1], cells[0]};
 }
 
-/// The cells [first, last) that a window answers for, and [low, high) that it solves.
+/// The cells [first, last) that a window predicts, and [low, high) that it solves.
 struct Window {
   int first, last, low, high;
 };
@@ -82,7 +82,7 @@ struct CellRange {
   int first_row, last_row, first_col, last_col;  ///< half-open
 };
 using Visit = std::function<void(Span rows, Span cols)>;
-/// Calls the visitor with the places asked for that lie on the cells, as rows x cols.
+/// Calls the visitor with the queries on the cells, as rows x cols.
 using Places = std::function<void(const CellRange&, const Visit&)>;
 
 /// Posterior of one window of a lattice.
@@ -142,7 +142,7 @@ class WindowSolver {
   ThreadPool& workers_;
 };
 
-/// Solves window after window; `places_of` gives the places in one, `count` is that of all places.
+/// Solves window after window; `places_of` gives the queries in one, `count` is the number of all queries.
 void predict(const Points& points, const Hyperparameters& parameters, const Box queries[2], std::size_t count,
              const std::function<Places(const Lattice&, const Window&, const Window&)>& places_of,
              const Maps& maps, int stride, int threads) {
@@ -167,7 +167,7 @@ void predict(const Points& points, const Hyperparameters& parameters, const Box 
     }
 }
 
-/// The samples at origin + step * index that lie on the cells of a window, relative to it.
+/// The samples at origin + step * index on the cells of a window, relative to it.
 std::vector<Sample> axis_samples(double origin, double step, int count, double corner, double spacing,
                                  const Window& window, int cells) {
   std::vector<Sample> samples;
@@ -188,7 +188,7 @@ Span on_cells(const std::vector<Sample>& sorted, int first, int last) {
   return {sorted.data() + (begin - sorted.begin()), sorted.data() + (end - sorted.begin())};
 }
 
-/// A place of its own, by the cell of the window it lies on.
+/// A single query, by the cell of the window that contains it.
 struct Place {
   int row, col;
   double v, u;

@@ -12,7 +12,7 @@ constexpr double kTolerance =
     5e-4;  // a correction, as a share of the solution; the error left is far smaller
 constexpr double kNegligible = 1e-7;  // a correction, as a share of the prior's deviation
 
-/// Size of what the weights say about the slopes.
+/// Size of the slopes that the weights represent.
 double roughness(const RowMatrix& w) {
   return std::sqrt((w.rightCols(w.cols() - 1) - w.leftCols(w.cols() - 1)).squaredNorm() +
                    (w.bottomRows(w.rows() - 1) - w.topRows(w.rows() - 1)).squaredNorm());

@@ -10,8 +10,8 @@
 namespace terrainloop::gp {
 namespace {
 
-/// Calls body(row) for every row, those that lie closer than a B-spline's support never at once: what they
-/// add to shared places is summed in the same order whatever the number of threads.
+/// Calls body(row) for every row, rows closer than a B-spline's support never at once: what they add to
+/// shared entries is summed in the same order whatever the number of threads.
 template <typename Body>
 void striped(ThreadPool& workers, int rows, const Body& body) {
   for (int stripe = 0; stripe < std::min(kSupport, rows); ++stripe)
@@ -51,7 +51,7 @@ constexpr std::array<Pair, kPairs> list_pairs() {
 
 constexpr std::array<Pair, kPairs> kPairList = list_pairs();
 
-/// Adds pair products to the places of their offsets, which lie `stride` apart (the compiler unrolls it).
+/// Adds pair products to the entries of their offsets, which are `stride` apart (the compiler unrolls it).
 template <int turn = 0>
 void add_turns(const double* products, double* entries, int stride) {
   if constexpr (turn < kTurns) {

@@ -9,7 +9,7 @@
 #include "terrainloop/gp.hpp"
 #include "thread_pool.hpp"
 
-/// What the points say about the weights of the spline.
+/// The information of the points on the weights of the spline.
 namespace terrainloop::gp {
 
 using RowMatrix = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
@@ -25,7 +25,7 @@ struct Lattice {
   int knot_cols() const { return cols + kDegree; }
 };
 
-/// A point relative to the cell it lies in, with 1 / noise^2 as its weight.
+/// A point relative to its cell, with 1 / noise^2 as its weight.
 struct CellPoint {
   double u, v;  ///< within the cell, [0, 1]
   double elevation, weight;
@@ -43,7 +43,7 @@ BinnedPoints bin(const Points& points, const Lattice& lattice);
 /// Information matrix Phi' W Phi and vector Phi' W z of the weights.
 ///
 /// A product of B-splines depends on the unordered pair of knots in each axis only, so the entry of the
-/// knots (i, j) and (i', j') stands once, at (min(i, i'), min(j, j')) and the offsets |i - i'|, |j - j'|.
+/// knots (i, j) and (i', j') is stored once, at (min(i, i'), min(j, j')) and the offsets |i - i'|, |j - j'|.
 class Information {
  public:
   Information(const BinnedPoints& binned, const Lattice& lattice, ThreadPool& workers);

@@ -9,7 +9,7 @@
 namespace terrainloop::gp {
 namespace {
 
-constexpr int kCells = 10;          // a subdomain answers for, along each axis
+constexpr int kCells = 10;          // that a subdomain predicts, along each axis
 constexpr double kSingular = 1e-6;  // least pivot of a factor, as a share of the greatest
 constexpr double kPinning = 0.1;    // weight of the whole axis' precision against the interval's own
 

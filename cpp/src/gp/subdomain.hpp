@@ -7,7 +7,7 @@
 /// Overlapping parts of a lattice, each small enough for a dense factor.
 namespace terrainloop::gp {
 
-/// One axis of a subdomain: the cells it answers for, and the knots it solves for.
+/// One axis of a subdomain: the cells that it predicts, and the knots that it solves for.
 struct Interval {
   int first_cell, last_cell;  ///< half-open
   int first_knot, last_knot;  ///< half-open
@@ -16,7 +16,7 @@ struct Interval {
 
   int cells() const { return last_cell - first_cell; }
   int knots() const { return last_knot - first_knot; }
-  /// Knots whose functions are not zero on the cells: cells() + kDegree from this one on, relative.
+  /// Knots whose functions are nonzero on the cells: cells() + kDegree from this one on, relative.
   int support() const { return first_cell - first_knot; }
 };
 

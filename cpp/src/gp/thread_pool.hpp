@@ -31,7 +31,8 @@ class ThreadPool {
   ThreadPool(const ThreadPool&) = delete;
   ThreadPool& operator=(const ThreadPool&) = delete;
 
-  /// Calls body(0) ... body(count - 1), in any order; rethrows the first exception. Calls take turns.
+  /// Calls body(0) ... body(count - 1), in any order; rethrows the first exception. Concurrent calls are
+  /// serialised.
   void run(int count, const std::function<void(int)>& body) {
     const std::lock_guard<std::mutex> turn(running_);
     start_threads(count);

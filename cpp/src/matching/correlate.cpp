@@ -21,7 +21,7 @@ Complex times(const Complex& a, const float* b) {
   return {a.re * b[0] - a.im * b[1], a.re * b[1] + a.im * b[0]};
 }
 
-/// What is kept of one block of rotations while it is tried.
+/// The state of one block of rotations while it is processed.
 class Block {
  public:
   Block(const TurnedSpectra& source, const StoredSpectra& stored, int size, double least_shared)
@@ -51,13 +51,13 @@ class Block {
   }
 
  private:
-  /// Pixels shared, and the product of the energies over them, at every second shift.
+  /// Number of shared pixels, and the product of the energies over them, at every second shift.
   void measure_ground(int block) {
     const std::size_t waves = static_cast<std::size_t>(half_) * half_fft_.waves();
     const float* known = source_.ground + block * 2 * waves * 2 * kLanes;
     const float* energy = known + waves * 2 * kLanes;
     const float *stored_known = stored_.ground, *stored_energy = stored_known + 2 * waves;
-    // Of 2 x 2 pixels by 2 x 2 others: each pixel meets four.
+    // 2 x 2 pixels times 2 x 2 others: each pixel is counted four times.
     const float scale = 1.0f / 4.0f / static_cast<float>(half_ * half_);
     const auto product = [](const float* a, const float* b) {
       return [a, b](int wave) { return times(lanes_at(a, wave), b + 2 * wave); };
@@ -76,8 +76,8 @@ class Block {
     });
   }
 
-  /// At every shift: by what the square of a sum of products becomes r^2 times shared ground; 0 where that is
-  /// too little.
+  /// At every shift, the factor from the square of a sum of products to r^2 times the shared area; 0 where
+  /// the area is too small.
   void weigh() {
     Lanes largest = Lanes::Constant(std::numeric_limits<float>::min());
     for (const Lanes& energies : half_energies_) largest = largest.max(energies);
@@ -93,7 +93,7 @@ class Block {
       }
   }
 
-  /// What is known of every second row and column, interpolated.
+  /// Values at every second row and column, interpolated.
   Lanes between(const std::vector<Lanes>& values, int row, int column) const {
     const int above = row / 2 * half_, below = (row + 1) / 2 % half_ * half_;
     const int left = column / 2, right = (column + 1) / 2 % half_;
@@ -101,7 +101,7 @@ class Block {
            (values[above + left] + values[above + right] + values[below + left] + values[below + right]);
   }
 
-  /// Signed r^2 times the shared ground at each shift, and the sum of its size over them.
+  /// Signed r^2 times the shared area at each shift, and the sum of its absolute values.
   void correlate_fields(int block) {
     const std::size_t waves = static_cast<std::size_t>(size_) * fft_.waves();
     const float* x = source_.fields + block * 2 * waves * 2 * kLanes;
@@ -131,7 +131,7 @@ class Block {
       }
   }
 
-  /// Whether no shift beside this one agrees better; of equals the first counts.
+  /// Whether no neighbouring shift agrees better; of equal ones the first counts.
   bool is_peak(int row, int column, int lane) const {
     const int shift = row * size_ + column;
     for (const int down : {size_ - 1, 0, 1})

@@ -37,7 +37,7 @@ inline Complex operator*(const Phase& w, const Complex& a) {
   return {w.re * a.re - w.im * a.im, w.re * a.im + w.im * a.re};
 }
 
-/// Unscaled inverse FFT, sum of X_k exp(2 pi i j k / n), kLanes at a time, of numbers that stand in a row.
+/// Unscaled inverse FFT, sum of X_k exp(2 pi i j k / n), kLanes at a time, of contiguous numbers.
 /// Stockham's: each pass sorts as it goes (Van Loan, Computational Frameworks for the FFT, 1992, 1.7).
 class InverseFft {
  public:
@@ -48,7 +48,7 @@ class InverseFft {
     if (n != 1) throw std::invalid_argument("size must have no factors but 2, 3 and 5");
   }
 
-  /// Where the result is: `data` or `scratch`, both n long and both overwritten.
+  /// Pointer to the result: `data` or `scratch`, both n long and both overwritten.
   Complex* operator()(Complex* data, Complex* scratch) const {
     int stride = 1;
     for (const Pass& pass : passes_) {
@@ -74,7 +74,7 @@ class InverseFft {
  private:
   struct Pass {
     int radix;
-    std::vector<Phase> twiddles;  // radix - 1 for each of the butterflies
+    std::vector<Phase> twiddles;  // radix - 1 for each butterfly
   };
 
   void add_pass(int radix, int n) {
@@ -146,7 +146,8 @@ class InverseRealFft2 {
 
   int waves() const { return size_ / 2 + 1; }
 
-  /// wave(k) is the k-th number of the half spectrum; consume(row, line) takes the result, `size` in a line.
+  /// wave(k) is the k-th number of the half spectrum; consume(row, line) receives the result, `size` per
+  /// line.
   template <typename Wave, typename Consume>
   void operator()(const Wave& wave, const Consume& consume) {
     for (int column = 0; column < waves(); ++column) {
@@ -161,7 +162,7 @@ class InverseRealFft2 {
   }
 
  private:
-  /// Even places of the result are the real part of a transform of half the length, odd ones the imaginary.
+  /// Even entries of the result are the real part of a transform of half the length, odd ones the imaginary.
   void to_real(const Complex* x) {
     const int half = size_ / 2;
     for (int k = 0; k < half; ++k) {
@@ -182,15 +183,15 @@ class InverseRealFft2 {
   std::vector<Lanes> line_;
 };
 
-/// Conjugate half spectra of two real images, sum of x_j exp(2 pi i j k / size): those of x + i y, taken
-/// apart.
+/// Conjugate half spectra of two real images, sum of x_j exp(2 pi i j k / size): those of x + i y,
+/// separated.
 class ConjugateFft2 {
  public:
   explicit ConjugateFft2(int size)
       : size_(size), fft_(size), buffer_(2 * size), plane_(static_cast<std::size_t>(size) * size) {}
 
-  /// pixel(row, column) is x + i y, of a square with `extent` pixels a side; write(which, wave, value) takes
-  /// the number of a wave in the half spectrum of image 0 or 1.
+  /// pixel(row, column) is x + i y, of a square with sides of `extent` pixels; write(which, wave, value)
+  /// receives the value at a frequency in the half spectrum of image 0 or 1.
   template <typename Pixel, typename Write>
   void operator()(int extent, const Pixel& pixel, const Write& write) {
     const Complex zero{Lanes::Zero(), Lanes::Zero()};

@@ -18,7 +18,7 @@ std::array<float, 4> cubic_weights(float f) {
   return {far(1 + f), near(f), near(1 - f), far(2 - f)};
 }
 
-/// Both images between sixteen pixels; those outside are 0.
+/// Cubic interpolation of both images from sixteen pixels; those outside are 0.
 std::pair<float, float> cubic(const ImageView<float>& x, const ImageView<float>& y, const Place& at) {
   const std::array<float, 4> across = cubic_weights(at.right), down = cubic_weights(at.down);
   const int top = at.row - 1, left = at.col - 1;

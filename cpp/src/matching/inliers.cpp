@@ -11,7 +11,7 @@ void count_inliers(const double* source, const double* target, std::size_t count
   if (!(radius > 0.0)) throw std::invalid_argument("the radius must be positive");
   if (count > static_cast<std::size_t>(std::numeric_limits<int>::max()))
     throw std::invalid_argument("there must be fewer than 2^31 associations");
-  std::vector<double> x(count), y(count), u(count), v(count);  // apart, so that the loop is vectorised
+  std::vector<double> x(count), y(count), u(count), v(count);  // separate, so that the loop is vectorised
   for (std::size_t i = 0; i < count; ++i) {
     x[i] = source[2 * i];
     y[i] = source[2 * i + 1];

@@ -7,7 +7,7 @@
 
 namespace terrainloop {
 
-/// Where a pixel of one image lies in another: the pixel up and left of it, and how far beyond that.
+/// Position of a pixel of one image in another: the pixel up and left of it, and the fraction beyond that.
 struct Place {
   int col, row;
   float right, down;
@@ -23,7 +23,7 @@ struct Place {
   }
 };
 
-/// Between four pixels; those outside the image are 0.
+/// Bilinear interpolation; pixels outside the image are 0.
 template <typename T>
 float bilinear(const ImageView<T>& image, const Place& at) {
   const bool inside = at.row >= 0 && at.col >= 0 && at.row + 1 < image.rows && at.col + 1 < image.cols;
