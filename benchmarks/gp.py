@@ -30,7 +30,7 @@ CROP = 2.6  # metres: a square small enough to be solved exactly from all its po
 
 
 def surface(points):
-    """Training data as every method gets them: (N, 2) and (N,), the plane taken out."""
+    """Training data for every method: (N, 2) and (N,), the plane subtracted."""
     from terrainloop.gp.training import detrend
 
     made = detrend(points)
@@ -43,7 +43,7 @@ def axes(xy, resolution=RESOLUTION):
 
 
 def textbook(xy, z, x, y, threads):
-    """The dense solve as the equations have it: one Cholesky factor, one triangular solve per pixel."""
+    """The dense solve by the book: one Cholesky factor, one triangular solve per pixel."""
     from scipy.linalg import cho_solve, cholesky, solve_triangular
     from threadpoolctl import threadpool_limits
 
@@ -162,14 +162,14 @@ METHODS = {
 AS_DENSE = (
     "scikit-learn",
     "GPyTorch exact",
-)  # a pixel costs what it costs densely: the small submap is enough
+)  # a pixel costs as much as in the dense solve: the small submap is enough
 OURS = "spline (`solver: spline`)"
 EXACT = "dense, our tiles (`solver: exact`)"
 TEXTBOOK = "dense, textbook (NumPy, SciPy)"
 
 
 def memory_mb(field):
-    """Of this process, from Linux; a forked child's ru_maxrss would be its parent's."""
+    """Peak memory of this process, from Linux; a forked child's ru_maxrss would be its parent's."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(field)) / 1024
 
@@ -207,7 +207,7 @@ def run(out, method, xy, z, x, y, threads, repeats):
 
 
 def errors(maps, exact):
-    """Where the exact variance is below a tenth of the prior's, as shares of the exact."""
+    """Relative errors where the exact variance is below a tenth of the prior's."""
     known = exact[3] < 0.1 * VARIANCE
     result = {"known": float(known.mean())}
     gradient = np.hypot(*exact[1:3])[known]

@@ -2,8 +2,8 @@
 
     python benchmarks/local_noise.py
 
-Simulated stereo drives along a path, put together at their true poses, so that nothing but the sensor's noise
-is left. The true slopes are those of the terrain smoothed by 7 cm, which is less than the maps resolve.
+Simulated stereo drives along a path, assembled at their true poses, so that only the sensor's noise
+remains. The true slopes are those of the terrain smoothed by 7 cm, which is less than the maps resolve.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Matching measured: recall by what proposes and decides, false alarms, covariance, time.
+"""Benchmarks of matching: recall by method, false alarms, covariance, time.
 
     python benchmarks/matching.py recall MISSION...   keypoints, dense, both: by shared ground and direction
     python benchmarks/matching.py null MISSION...     submaps of different missions, which share nothing
@@ -7,8 +7,8 @@
     python benchmarks/matching.py sensors             stereo submaps against LiDAR submaps of one world
 
 A mission is a folder with clouds and truth.tum ('terrainloop simulate' makes some); passes.csv beside them
-names sessions, of which only different ones are compared. Maps are kept in ~/.cache/terrainloop-benchmarks.
-With --figure F.png, null and errors also draw what was expected against what was observed.
+names sessions; only pairs of different sessions are compared. Maps are cached in
+~/.cache/terrainloop-benchmarks. With --figure F.png, null and errors also plot expected against observed.
 """
 
 import argparse
@@ -102,7 +102,7 @@ def processes():
 
 
 def judged(pool, folder, method):
-    """Every pair of a mission that odometry does not join, and the truth about it."""
+    """Every pair of a mission that odometry does not connect, evaluated against the ground truth."""
     submaps, records, poses, sessions = mapped(folder)
     jobs = []
     for i, submap in enumerate(submaps):
@@ -196,7 +196,7 @@ def null(folders, figure):
         f"{count} pairs that share nothing; accepted as one mission with max_false_loops 0.01: {accepted}\n"
     )
     levels = (1, 0.1, 0.03, 0.01, 0.003, 0.001)
-    print("| worlds | pairs | " + " | ".join(f"{x:g} a pair" for x in levels) + " | largest score |")
+    print("| worlds | pairs | " + " | ".join(f"{x:g} per pair" for x in levels) + " | largest score |")
     print("|---" * (len(levels) + 3) + "|")
     for name, values in {"all": np.concatenate(list(scores.values())), **scores}.items():
         values = np.asarray(values)

@@ -1,4 +1,4 @@
-"""Simulated stereo submaps of known ground, as the benchmarks need them."""
+"""Simulated stereo submaps of known ground, for the benchmarks."""
 
 import numpy as np
 

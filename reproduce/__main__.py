@@ -1,7 +1,7 @@
 """The paper's datasets are not public: Etna1 to Etna4 and Morocco are simulated stand-ins here.
 
-Regenerates the paper's figures and tables, with today's peers and with two missions beyond it (Mars and
-EtnaLidar, simulated, too): ``python -m reproduce`` from the root of the repository. Real missions are given
+Regenerates the paper's figures and tables, with today's peers and with two additional missions (Mars and
+EtnaLidar, also simulated): ``python -m reproduce`` from the root of the repository. Real missions are given
 with --mission. Every OUT/NAME.png has its numbers in OUT/NAME.csv. Run it again to resume: results
 are reused as long as code, missions and settings stay the same.
 """
@@ -39,7 +39,7 @@ TIMES = (
     "MB of what is kept of a submap, pickled."
 )
 NONE = "'-': no pair could be compared: there are no images, colours or odometry, or too little was found."
-REAL = ROOT.parent / "shared/data/missions/pozo_r20"  # taken where it is there
+REAL = ROOT.parent / "shared/data/missions/pozo_r20"  # used if it exists
 BASELINES = "reproduce.baselines."
 PAPERS = ("default", "paper", "shot", "random_score")
 PEERS = ("default", "fpfh", "kiss", "map_closures", "scan_context", "odometry_icp", "ibow", "random_score")
@@ -98,7 +98,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def drives_of(args: argparse.Namespace, out: Path) -> list[Drive]:
-    """All missions, the simulated ones made where they are not there yet."""
+    """All missions; simulated ones are made unless they exist."""
     stand_ins, submaps = (QUICK, SUBMAPS_QUICK) if args.quick else ((*PAPER, *BEYOND), SUBMAPS)
     given = [*args.mission, *([REAL] if REAL.exists() and not args.quick else [])]
     reals = [real(path, out / "missions") for path in dict.fromkeys(path.resolve() for path in given)]
@@ -106,7 +106,7 @@ def drives_of(args: argparse.Namespace, out: Path) -> list[Drive]:
 
 
 def record_run(args: argparse.Namespace, out: Path, drives: Sequence[Drive]) -> None:
-    """What the numbers depend on, as settings.json."""
+    """Write everything that the numbers depend on to settings.json."""
     record = {
         "note": STAND_INS,
         "arguments": sys.argv[1:],
@@ -137,7 +137,7 @@ def machine() -> dict[str, str | int | None]:
 def write_figures(
     args: argparse.Namespace, out: Path, drives: Sequence[Drive], results: Sequence[Result]
 ) -> None:
-    """Each that was asked for."""
+    """Write each figure and table that was requested."""
     by_mission = {drive.name: [r for r in results if r.drive is drive] for drive in drives}
     if "fig6" in args.only:
         figures.trajectories(drives).save(out, "fig6")
@@ -156,7 +156,7 @@ def write_figures(
 
 
 def curves(by_mission: Mapping[str, Sequence[Result]], modules: Sequence[str], out: Path, name: str) -> None:
-    """As the paper has them, and where a match is right only with its pose."""
+    """The curves by the paper's criterion, and those where a match is right only if its pose is."""
     methods = dict.fromkeys(r.method for results in by_mission.values() for r in results)
     looks = figures.looks_of(list(methods))
     for criterion, stem in (("overlap", name), ("pose", f"{name}_pose")):

@@ -21,7 +21,7 @@ from terrainloop.io.files import write_whole_text
 from terrainloop.report.figures import SOURCE_COLOUR, TARGET_COLOUR, save_figure
 
 INLIER_THRESHOLDS = tuple(range(1, 21))  # the paper's
-DRAWN_POINTS = 15_000  # of a submap; more do not show at this size
+DRAWN_POINTS = 15_000  # of a submap; more are not visible at this size
 COLUMNS = 3  # of panels
 GREY = "0.55"
 
@@ -139,7 +139,7 @@ def _counts(point: OperatingPoint) -> dict[str, float]:
 
 
 def precision_by_inliers(results: Sequence[Result]) -> Plate:
-    """Precision against the least number of inliers, each mission and all together (Fig. 9)."""
+    """Precision against the minimum number of inliers, for each mission and all together (Fig. 9)."""
     figure = Figure(figsize=(7, 4.2), layout="constrained")
     axes = figure.add_subplot()
     counted = {}
@@ -180,7 +180,7 @@ def precision_by_inliers(results: Sequence[Result]) -> Plate:
 
 
 def aligned_clouds(result: Result) -> Plate:
-    """The surest of the pairs that a method registered rightly, by odometry and as it has them (Fig. 10).
+    """The highest-scoring pair that a method registered correctly, by odometry and by that pose (Fig. 10).
 
     From above: source red, target blue, the others grey; '+' at the origins of the frames.
     """
@@ -231,7 +231,7 @@ def _row_of_loop(drive: Drive, method: str, pair: EvaluatedPair) -> dict[str, An
 
 
 def looks_of(methods: Sequence[str]) -> dict[str, Look]:
-    """How the lines of each method look, the same in every figure: the first is thick, behind the others."""
+    """Line styles of each method, the same in every figure: the first is thick, behind the others."""
     colours = [*colormaps["tab10"].colors, *colormaps["Dark2"].colors]
     looks: dict[str, Look] = {}
     for method, colour in zip(methods, colours, strict=False):

@@ -1,6 +1,6 @@
 """Stored results are reused only if the code, the data and the settings behind them are still the same.
 
-Each has a record beside it: a JSON file with a fingerprint under "key".
+Each has a record next to it: a JSON file with a fingerprint under "key".
 """
 
 import json

@@ -202,7 +202,9 @@ def real(path: Path, folder: Path) -> Drive:
         return drive
     print(f"{drive.name}: of {len(drive.mission)} submaps the {REAL_SUBMAPS} nearest the middle")
     part = folder / path.name
-    shutil.rmtree(part, ignore_errors=True)  # links and two tables, cheap enough to be rewritten every time
+    shutil.rmtree(
+        part, ignore_errors=True
+    )  # links and two tables are cheap enough to be rewritten every time
     _write_part(drive, part)
     return Drive(path.name, part, REAL_MIN_OVERLAP)
 

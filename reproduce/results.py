@@ -1,4 +1,4 @@
-"""What the runner left, read back and evaluated."""
+"""Output of the runner, read back and evaluated."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,7 +16,7 @@ from terrainloop.evaluation.precision_recall import Metrics
 from terrainloop.evaluation.truth import GroundTruth
 
 CRITERIA = ("overlap", "overlap and pose", "pose")  # the paper's; the strictest; see `evaluation.criteria`
-GROUNDS = ("boxes", "observed")  # the paper's: bounding boxes; ground that was really seen
+GROUNDS = ("boxes", "observed")  # the paper's: bounding boxes; ground that was actually observed
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +27,11 @@ class Result:
     ----------
     drive : Drive
     module, method : str
-        Where it comes from, and as tables print it.
+        Module that it comes from, and its name in tables.
     variant : int
         Number of the choice of settings.
     record : mapping
-        Settings, software, times, as the runner wrote them.
+        Settings, software and times, as written by the runner.
     pairs : list of EvaluatedPair
     """
 
@@ -57,7 +57,7 @@ class Result:
 
     @cached_property
     def criteria(self) -> dict[str, dict[str, Criterion]]:
-        """By the ground that counts, then by what is called right."""
+        """Criteria by the kind of overlap, then by what counts as right."""
         return {
             ground: criteria(self.pairs, self.drive.min_overlap, observed=ground == "observed")
             for ground in GROUNDS
@@ -72,7 +72,7 @@ class Result:
 
     @cached_property
     def registered(self) -> list[EvaluatedPair]:
-        """The true pairs that got the right pose, whatever their score."""
+        """The true pairs with the right pose, whatever their score."""
         true = self.criteria["boxes"]["overlap"].is_true
         return [
             pair for pair, is_true in zip(self.pairs, true, strict=True) if is_true and pair.pose_is_right

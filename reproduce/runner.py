@@ -49,12 +49,12 @@ class Task:
     ----------
     drive : Drive
     module : str
-        What `methods_of` finds it by ...
+        Name by which `methods_of` finds it ...
     variant : int
-        ... and in which place.
+        ... and its index there.
     method : Method
     folder : Path
-        Of the mission's results.
+        Folder of the mission's results.
     """
 
     drive: Drive
@@ -116,7 +116,7 @@ def methods_of(module: str, drive: Drive, scale: Scale) -> tuple[Method, ...]:
 
 
 def tasks_of(drive: Drive, modules: Iterable[str], out: Path, *, first_only: bool) -> list[Task]:
-    """Every method and variant on a mission; one that cannot run here is told in one line, left out.
+    """Every method and variant on a mission; those that cannot run here are left out, with a message.
 
     With `first_only`, the first variant of each method.
     """
@@ -137,7 +137,7 @@ def tasks_of(drive: Drive, modules: Iterable[str], out: Path, *, first_only: boo
 
 
 def run_all(tasks: Sequence[Task], workers: int) -> list[Task]:
-    """Run what is not done yet, as many at a time as there are workers; return what is done then."""
+    """Run all tasks that are not done, as many at a time as there are workers; return the finished ones."""
     waiting = [task for task in tasks if not task.done]
     print(f"{len(tasks)} tasks, {len(tasks) - len(waiting)} of them done before", flush=True)
     processors: Queue[int] = Queue()
@@ -152,7 +152,7 @@ def run_all(tasks: Sequence[Task], workers: int) -> list[Task]:
 
 
 def run_apart(task: Task, processors: Queue[int]) -> str:
-    """Run a task in its own process; say in a line how it went, and keep its output where it failed."""
+    """Run a task in its own process; report the outcome in one line, with the output kept if it failed."""
     task.folder.mkdir(parents=True, exist_ok=True)
     processor = processors.get()
     order = {
@@ -186,7 +186,7 @@ def run_apart(task: Task, processors: Queue[int]) -> str:
 
 
 def execute(task: Task) -> None:
-    """Describe the submaps in order, score the pairs, write both files whole or not at all."""
+    """Describe the submaps in order, score the pairs, write both files completely or not at all."""
     method, names = task.method, task.drive.mission.names
     kept, describing = [], Stopwatch()
     for observation in task.drive.observations():
@@ -221,8 +221,8 @@ def execute(task: Task) -> None:
 class Stopwatch:
     """Milliseconds of each ``with`` block: on the wall, and of the processor for all threads and children.
 
-    The second is what the table prints: other work on the machine does not lengthen it, and threads that a
-    library starts in spite of all do not shorten it.
+    The table prints the second: other work on the machine does not lengthen it, and threads that a library
+    starts in spite of the settings do not shorten it.
     """
 
     def __init__(self):
@@ -248,7 +248,7 @@ class Stopwatch:
 
 
 def megabytes(kept: Sequence[Any]) -> float | None:
-    """Median size of what is kept of a submap, pickled; None for what cannot be."""
+    """Median size of the pickled description of a submap; None if it cannot be pickled."""
     try:
         return float(np.median([len(pickle.dumps(one)) for one in kept])) / 1e6
     except (TypeError, AttributeError, pickle.PicklingError):
@@ -277,7 +277,7 @@ def read_pairs(path: Path) -> list[Scored]:
 
 
 def main(order: Mapping[str, Any]) -> None:
-    if hasattr(os, "sched_setaffinity"):  # what threads by TBB asks for as many as there are processors
+    if hasattr(os, "sched_setaffinity"):  # TBB starts as many threads as there are processors
         os.sched_setaffinity(0, {order["processor"]})
     drive = Drive(order["name"], Path(order["mission"]), order["min_overlap"])
     method = methods_of(order["module"], drive, Scale(**order["scale"]))[order["variant"]]

@@ -1,4 +1,4 @@
-"""The tables: method by mission, every choice of settings, times; as CSV, and as Markdown to be read."""
+"""The tables: method by mission, every choice of settings, times; as CSV, and as Markdown for reading."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -57,7 +57,7 @@ def _numbers(metrics: Metrics) -> dict[str, float]:
 
 
 def sweep(results: Iterable[Result]) -> Rows:
-    """Every choice of settings by every criterion and overlap: nothing selected."""
+    """Every choice of settings by every criterion and overlap, without selection."""
     return [
         {
             "mission": result.drive.name,

@@ -17,7 +17,7 @@ from terrainloop.geometry import yaw_of
 from terrainloop.io.files import write_whole_text
 
 SKIPPED = 14  # images just before one: two submaps of 7 m, as pairs of neighbours are left out
-NEAR = 2.0  # metres between two cameras that are at the same place
+NEAR = 2.0  # metres between two cameras at the same place
 ALIKE = np.radians(30.0)  # between two headings with the same view
 
 

@@ -1,6 +1,6 @@
-"""What the ground of a simulated world looks like: grain, stones, rocks, sun and shadows.
+"""Appearance of the ground of a simulated world: grain, stones, rocks, sun and shadows.
 
-The look of a point depends only on the world, the seed, its position and the sun. All noise comes from
+The appearance of a point depends only on the world, the seed, its position and the sun. All noise comes from
 hashed lattices, each rotated and shifted at random, so that nothing is periodic.
 """
 
@@ -72,13 +72,13 @@ def light(terrain: Terrain, sun: Sun, reach: float = 8.0) -> Light:
 
 
 def _shifted(image: Image, by: Array) -> Image:
-    """The image (rows, columns) as seen ``by`` so many rows and columns ahead."""
+    """The image (rows, columns) shifted by a number of rows and columns."""
     return np.asarray(ndimage.shift(image, -by, order=1, mode="nearest"))
 
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """A terrain with its look; make it with `ground_of`.
+    """A terrain with its appearance; make it with `ground_of`.
 
     Attributes
     ----------
@@ -87,10 +87,10 @@ class Ground:
     look : Look
         Its material.
     nodes : array, (rows, columns, 5) float32
-        At each node of the terrain slope along x and y, the same two smoothed by `FAR_BLUR`, and 1 on
+        At each node of the terrain: slope along x and y, the same two smoothed by `FAR_BLUR`, and 1 on
         rocks, 0 elsewhere.
     salt : int
-        What the hashes of this world and seed are mixed with.
+        Number that the hashes of this world and seed are mixed with.
     """
 
     terrain: Terrain
@@ -99,7 +99,7 @@ class Ground:
     salt: int
 
     def brightness(self, xy: Array, footprint: ArrayLike, light: Light) -> Image:
-        """Light that the ground sends out, in red, green and blue (N, 3); white paper facing the sun is 1.
+        """Light reflected by the ground, in red, green and blue (N, 3); white paper facing the sun is 1.
 
         Lambert's law on the slopes of terrain, grain and stones, times the albedo.
 
@@ -108,7 +108,7 @@ class Ground:
         xy : array, (N, 2)
             World points in metres.
         footprint : array, (N,), or float
-            How much ground is seen as one, in metres; finer detail fades out.
+            Extent of the ground that is averaged, in metres; finer detail fades out.
         light : Light
             Sun and shadows.
         """
@@ -153,7 +153,7 @@ class Ground:
         chosen, lattice = chosen[there], lattice.only(there)
         x, y, size, tone = (lattice.hashed(salt + k) for k in range(1, 5))
         radius = 0.08 + 0.12 * size**2  # in cells; most are small
-        # So far from the borders stone and shadow lie within the cell, and no neighbour need be asked.
+        # At this distance from the borders stone and shadow are within the cell, so neighbours need no check.
         room = 1 - 2 * STONE_REACH * radius
         dx, dy = (w - 0.5 - room * (at - 0.5) for w, at in ((lattice.u, x), (lattice.v, y)))
         rho = np.hypot(dx, dy) / radius
@@ -170,7 +170,7 @@ class Ground:
 
 
 def _in_shadow(dx: Image, dy: Image, shadow: Array) -> Image:
-    """How dark it is at places around a dome of radius 1, given the shadow of a pole of height 1."""
+    """Darkness at points around a dome of radius 1, given the shadow of a pole of height 1."""
     length = float(np.hypot(*shadow))
     x, y = shadow / length
     along = np.clip(dx * x + dy * y, 0, min(STONE_HEIGHT * length, STONE_REACH - 1))
@@ -183,7 +183,7 @@ def ground_of(terrain: Terrain, world: str, seed: int) -> Ground:
     blur = FAR_BLUR / terrain.resolution
     smooth = [ndimage.gaussian_filter(slope, blur, mode="nearest") for slope in slopes]
     slopes_mean = [slope.mean() for slope in slopes]
-    # Rocks are what juts out of its surroundings by more than the roughness of any world does.
+    # Rocks are what rises above its surroundings by more than the roughness of any world.
     level = ndimage.gaussian_filter(terrain.height, 0.2 / terrain.resolution, mode="nearest")
     rock = np.clip((terrain.height - level - 0.015) / 0.02, 0, 1)
     salt = int(stream(seed, 0).generate_state(1)[0])
@@ -193,14 +193,14 @@ def ground_of(terrain: Terrain, world: str, seed: int) -> Ground:
 
 
 def _set_border(nodes: Image, value: ArrayLike) -> None:
-    """What is beyond the terrain looks like its border: let that be plain."""
+    """Make the border plain: everything beyond the terrain looks like it."""
     nodes[[0, -1]] = value
     nodes[:, [0, -1]] = value
 
 
 @dataclass(frozen=True, eq=False)
 class _Surface:
-    """Tone, slope and share of the sunlight (N,) of some places; layers of detail are added in place."""
+    """Tone, slope and share of the sunlight (N,) of some points; layers of detail are added in place."""
 
     tone: Image
     slope_x: Image

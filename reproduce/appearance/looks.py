@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Look:
-    """How the ground of a world looks.
+    """Appearance of the ground of a world.
 
     Attributes
     ----------

@@ -170,7 +170,7 @@ def closures(images: Sequence[Features], skip: int, island: int = 7, min_score: 
     Parameters
     ----------
     images : sequence of Features
-        In chronological order.
+        Features of the images in chronological order.
     skip : int
         Number of directly preceding images that are excluded.
     island : int
@@ -181,7 +181,7 @@ def closures(images: Sequence[Features], skip: int, island: int = 7, min_score: 
     Returns
     -------
     list of Closure
-        For each image the best earlier one.
+        The best earlier image for each image.
     """
     vocabulary, previous, found = Vocabulary(), None, []
     for i, features in enumerate(images):

@@ -1,4 +1,4 @@
-"""Our own pipeline, by default and as the paper has it, behind the interface of the baselines.
+"""Our own pipeline, with default settings and the paper's, behind the interface of the baselines.
 
 Everything that the reproduction calls of terrainloop's matching is called here.
 """
@@ -15,7 +15,7 @@ from terrainloop.loop import LoopCandidate
 from terrainloop.matching.register import compare
 from terrainloop.submap import Submap
 
-FITTED_SUBMAPS = 3  # the first of the mission, all that an online detector has seen
+FITTED_SUBMAPS = 3  # the first of the mission, as for an online detector
 PAPER = Settings.preset("paper")
 # The dense solve takes minutes per map; on the same points the spline has the same posterior (docs/solver.md)
 PAPER_SPLINE = PAPER.model_copy(update={"map": MapSettings(**PAPER.map.model_dump() | {"solver": "spline"})})

@@ -8,7 +8,7 @@ from reproduce.baselines.method import Match, Method, Observation, Scale
 
 
 def methods(scale: Scale) -> tuple[Method, ...]:
-    """One choice: there is nothing to scale and nothing to set."""
+    """One choice: there is nothing to scale or to set."""
     return (Method("random", {}, "hash of the two names", _describe, _score),)
 
 

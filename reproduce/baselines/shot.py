@@ -1,11 +1,11 @@
 """SHOT + RANSAC and CSHOT + RANSAC, the paper's own baselines, by the Point Cloud Library itself.
 
 As in the paper (section VI-C): keypoints of high curvature, matched by their descriptors, outliers removed
-by PCL's RANSAC, which goes on until an outlier-free sample was drawn with probability 0.99. Descriptors:
+by PCL's RANSAC, which continues until an outlier-free sample was drawn with probability 0.99. Descriptors:
 Tombari, Salti and Di Stefano, "Unique signatures of histograms for local surface description" (ECCV 2010),
 and with colours "A combined texture-shape descriptor for enhanced 3D feature matching" (ICIP 2011).
 
-PCL has no Python package: the small program `pcl/shot.cpp` is compiled when a method is first asked for.
+PCL has no Python package: the small program `pcl/shot.cpp` is compiled on first use.
 """
 
 import shutil
@@ -76,9 +76,9 @@ class Keypoints:
     Attributes
     ----------
     points : array, (K, 3)
-        In the submap's frame, metres.
+        Positions in the submap's frame, metres.
     descriptors : array, (K, 352) or (K, 1344)
-        Each of length 1.
+        Descriptors, each of length 1.
     """
 
     points: Array
@@ -129,7 +129,7 @@ def built_program() -> Path:
         cache.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=cache) as build:
             _build(Path(build))
-            (Path(build) / "shot").replace(program)  # at once: another process may be at it, too
+            (Path(build) / "shot").replace(program)  # atomically: another process may be compiling, too
     return program
 
 
@@ -153,7 +153,7 @@ def _missing(found: str) -> TerrainLoopError:
 
 
 def _run(program: Path, *words: object, rows: NDArray[np.float32] | None = None) -> bytes:
-    """What the program writes, given rows of six floats."""
+    """Output of the program, given rows of six floats."""
     given = b"" if rows is None else rows.tobytes()
     done = subprocess.run([program, *map(str, words)], input=given, capture_output=True, check=False)
     if done.returncode:
@@ -214,7 +214,7 @@ def _score(program: Path, settings: Settings, source: Keypoints | None, target: 
 
 
 def _matches(source: NDArray[np.float32], target: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Rows (2, M) of source and target: each other's nearest."""
+    """Rows (2, M) of source and target that are each other's nearest neighbours."""
     if not len(source) or not len(target):
         return np.empty((2, 0), dtype=np.intp)
     cosine = source @ target.T  # all have length 1, so that the squared distance is 2 - 2 cosine
