@@ -264,3 +264,34 @@ def test_settings_cannot_be_changed(path, name):
 def test_unknown_names_in_code_are_refused():
     with pytest.raises(ValidationError):
         Settings(sead=1)
+
+
+# --- the one knob
+
+
+def test_the_knob_may_be_given_at_the_top(file):
+    assert Settings(max_false_loops=0.5).match.max_false_loops == 0.5
+    both = Settings(match=MatchSettings(decision="inliers"), max_false_loops=0.5).match
+    assert (both.decision, both.max_false_loops) == ("inliers", 0.5)
+    file.write_text("max_false_loops: 0.5\nmatch: {iterations: 7}\n")
+    assert Settings.from_yaml(file).match == MatchSettings(iterations=7, max_false_loops=0.5)
+
+
+def test_settings_with_another_knob():
+    assert Settings().with_max_false_loops(None) == Settings()
+    assert Settings.preset("paper").with_max_false_loops(1).match.max_false_loops == 1
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+def test_a_knob_that_promises_nothing_is_refused(value, file):
+    with pytest.raises(TerrainLoopError, match="max_false_loops"):
+        Settings().with_max_false_loops(value)
+    file.write_text(f"max_false_loops: {str(value).replace('nan', '.nan').replace('inf', '.inf')}\n")
+    assert "max_false_loops" in refusal(file)
+
+
+def test_the_calibration_is_written_beside_every_result(file):
+    changed = Settings.model_validate({"calibration": {"tail": 0.9, "motion_by_strain": (1.0, 2.0, 3.0)}})
+    file.write_text(changed.to_yaml())
+    assert "tail: 0.9" in changed.to_yaml()
+    assert Settings.from_yaml(file) == changed

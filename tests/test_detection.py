@@ -1,12 +1,14 @@
 """The detector: loops of a revisit, its database, and whole missions with a broken cloud."""
 
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from conftest import BROKEN, PLACES
 
-from terrainloop.config import MatchSettings
+from terrainloop.config import MatchSettings, Settings
 from terrainloop.detection import detector as detecting
 from terrainloop.detection.detector import LoopDetector, fit_database, map_submap
 from terrainloop.detection.mission import detect_mission
@@ -256,3 +258,51 @@ def test_mission_of_broken_clouds_is_an_error(tmp_path, strict, fit):
     settings = strict if fit == "database" else per_submap(strict)
     with pytest.raises(TerrainLoopError, match=r"usable.*2 broken"):
         detect_mission(load_mission(tmp_path), settings)
+
+
+def test_the_detector_takes_the_knob(strict):
+    assert LoopDetector(strict, max_false_loops=0.3).settings.match.max_false_loops == 0.3
+    assert LoopDetector(max_false_loops=0.3).settings == Settings(max_false_loops=0.3)
+    with pytest.raises(TerrainLoopError, match="positive max_false_loops"):
+        LoopDetector(strict, max_false_loops=0)
+
+
+@pytest.mark.parametrize("settings", ["paper", 3, {}])
+def test_what_is_no_settings_is_refused(settings):
+    with pytest.raises(TerrainLoopError, match="expected settings"):
+        LoopDetector(settings)
+
+
+@pytest.mark.parametrize("submap", [np.zeros((300, 3)), "a.ply", None])
+def test_what_is_no_submap_is_refused(strict, submap):
+    with pytest.raises(TerrainLoopError, match="expected a Submap"):
+        LoopDetector(strict).add(submap)
+
+
+def test_submaps_without_a_name_are_numbered(submaps, strict):
+    detector = LoopDetector(strict, parameters=PARAMETERS)
+    for name in ("000000", "000001"):
+        detector.add(Submap(submaps[name].points))
+    assert list(detector.entries) == ["submap_000000", "submap_000001"]
+
+
+def test_threads_may_share_a_detector(mapped, strict):
+    """Every pair is compared once, whoever adds which submap when."""
+    compared = []
+    settings = strict.model_copy(update={"skip_recent": 0})
+    detector = LoopDetector(settings, parameters=PARAMETERS, on_pair=compared.append)
+    with ThreadPoolExecutor(4) as pool:
+        loops = [loop for found in pool.map(detector.add_entry, mapped.values()) for loop in found]
+    count = len(mapped)
+    assert len({frozenset(pair) for pair in pairs(compared)}) == len(compared) == count * (count - 1) // 2
+    assert len(loops) == len(detector.loops) == 1
+
+
+def test_sessions_may_repeat_names(mapped, strict):
+    again = [
+        replace(entry, record=replace(entry.record, session="second")) for entry in list(mapped.values())[:2]
+    ]
+    detector = LoopDetector(strict, parameters=PARAMETERS)
+    for entry in [*list(mapped.values())[:2], *again]:
+        detector.add_entry(entry)
+    assert list(detector.entries) == ["000000", "000001", "second/000000", "second/000001"]
