@@ -112,7 +112,7 @@ class Vocabulary:
         return len(self._words)
 
     def add(self, features: Features) -> None:
-        """Index an image: what it shares with a word is kept of that, the rest are new words."""
+        """Index an image: features that match a word update it, the others become new words."""
         matched, words = _clear_matches(self._matcher, features.descriptors)
         np.bitwise_and.at(self._words, words, features.descriptors[matched])
         new = np.setdiff1d(np.arange(len(features.descriptors)), matched)

@@ -63,7 +63,7 @@ class MapEntry:
 
     @property
     def summary(self) -> str:
-        """What was mapped, with which hyperparameters, and what was repaired, in one line."""
+        """Size of the map, hyperparameters and repairs, in one line."""
         p, (rows, columns) = self.gradient_map.parameters, self.gradient_map.mask.shape
         facts = [
             f"{self.record.points} points",

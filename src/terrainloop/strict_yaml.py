@@ -42,7 +42,7 @@ def read_yaml(path: Path | str) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """Knows the core schema of YAML 1.2 only, and bounds what it builds."""
+    """Knows only the core schema of YAML 1.2, and bounds the size of its result."""
 
     _depth = 0
 

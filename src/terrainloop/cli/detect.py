@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 HELP = """Find the loop closures among the submaps of a mission.
 
 Writes loops.csv (accepted), pairs.csv (every pair compared, with the reason), submaps.csv (every
-cloud, with repairs and errors), run.json (what was fitted) and config.yaml (the settings as run)."""
+cloud, with repairs and errors), run.json (fitted hyperparameters, counts) and config.yaml (all settings)."""
 
 
 def command(

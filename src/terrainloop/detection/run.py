@@ -162,7 +162,7 @@ class RunWriter:
     @classmethod
     @contextmanager
     def open(cls, folder: Path) -> Iterator["RunWriter"]:
-        """A writer into `folder`; what it wrote is gone at the end, unless `finish` was called."""
+        """A writer into `folder`; its files are removed at the end, unless `finish` was called."""
         for name in (*OF_A_RUN, *DERIVED):
             if (folder / name).is_dir():
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(folder / name))

@@ -113,7 +113,7 @@ class _Crew(Generic[Result]):
         """Keep the workers busy with the tasks below `limit`, or one with a suspect once all are idle."""
         if self._suspects:
             if all(worker.index is None for worker in self._workers):
-                while len(self._workers) > 1:  # what they hold may be the memory that was short
+                while len(self._workers) > 1:  # their memory may be what was missing
                     self._workers.pop().end()
                 if worker := self._idle():
                     worker.begin(self._suspects[0])

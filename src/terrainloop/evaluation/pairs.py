@@ -43,7 +43,7 @@ class Tolerance:
     def for_submaps(
         cls, records: Sequence[SubmapRecord], position: float | None = None, yaw: float | None = None
     ) -> "Tolerance":
-        """The tolerance for submaps of this size: what is given, else the default.
+        """The tolerance for submaps of this size: the given one, else the default.
 
         The default position tolerance is 1 m, but at least 2 % and at most 10 % of the size of the
         submaps: 1 m for submaps of 10 to 50 m, 0.5 m at 5 m, 10 m at 500 m. Their size is the square root

@@ -17,7 +17,7 @@ class Header(NamedTuple):
 
 
 def read_header(file: IO[bytes]) -> Header:
-    """The header of an NPY stream; raises ValueError if it is none."""
+    """The header of an NPY stream; raises ValueError if it is not one."""
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     version = np.lib.format.read_magic(file)
     if version not in readers:  # 3.0 is for structured types alone

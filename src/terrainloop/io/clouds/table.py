@@ -141,7 +141,7 @@ def columns_in_text(
 ) -> dict[str, NDArray[Any]]:
     """The columns wanted of a cloud, from lines whose fields are (column, NumPy type) by name.
 
-    Numbers of a field declared as single precision are rounded to it, so that what it cannot hold is seen;
+    Numbers of a field declared as single precision are rounded to it, so that a loss of precision is noticed;
     others are kept as written.
     """
     wanted = [name for name in fields if name.lower() in ("x", "y", "z", *INTENSITY)]
