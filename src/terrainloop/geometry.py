@@ -90,12 +90,12 @@ def fit_se2(source: ArrayLike, target: ArrayLike) -> Array:
     source, target = (points[..., 0] + 1j * points[..., 1] for points in (source, target))
     source_centroid, target_centroid = source.mean(axis=-1), target.mean(axis=-1)
     s, t = source - source_centroid[..., None], target - target_centroid[..., None]
-    turn = (s.conj() * t).sum(axis=-1)
-    turn = np.where(turn == 0, 1.0, turn) / np.where(turn == 0, 1.0, np.abs(turn))
-    shift = target_centroid - turn * source_centroid
-    T = np.zeros((*turn.shape, 3, 3))
-    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2] = turn.real, -turn.imag, shift.real
-    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2] = turn.imag, turn.real, shift.imag
+    rotation = (s.conj() * t).sum(axis=-1)
+    rotation = np.where(rotation == 0, 1.0, rotation) / np.where(rotation == 0, 1.0, np.abs(rotation))
+    shift = target_centroid - rotation * source_centroid
+    T = np.zeros((*rotation.shape, 3, 3))
+    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2] = rotation.real, -rotation.imag, shift.real
+    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2] = rotation.imag, rotation.real, shift.imag
     T[..., 2, 2] = 1.0
     return T
 

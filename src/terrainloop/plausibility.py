@@ -59,8 +59,8 @@ def _no_surface(points: Array, heights: Array) -> str:
     order = np.lexsort((heights, cell))
     cell, heights = cell[order], heights[order]
     first, count = np.unique(cell, return_index=True, return_counts=True)[1:]
-    judged = count >= _FEWEST
-    if not judged.any():
+    examined = count >= _FEWEST
+    if not examined.any():
         return ""
     tenth = count // 10
     thickness = heights[first + count - 1 - tenth] - heights[first + tenth]
@@ -68,11 +68,11 @@ def _no_surface(points: Array, heights: Array) -> str:
     inner = (place >= np.repeat(tenth, count)) & (place < np.repeat(count - 1 - tenth, count))
     steps = np.append(np.diff(heights), 0.0)
     gap = np.maximum.reduceat(np.where(inner, steps, 0.0), first)
-    layered = judged & (gap > 0.5 * thickness) & (gap > 0.3 * side)
-    if layered.sum() > _LAYERED * judged.sum():
+    layered = examined & (gap > 0.5 * thickness) & (gap > 0.3 * side)
+    if layered.sum() > _LAYERED * examined.sum():
         apart = np.median(gap[layered])
         return f"two layers {apart:.2g} m apart, as of a floor and a ceiling: no map of one surface"
-    thick = float(np.median(thickness[judged]))
+    thick = float(np.median(thickness[examined]))
     if thick > _THICK * side:
         return f"points fill a volume, {thick:.2g} m thick within {side:.2g} m: no map of one surface"
     return ""

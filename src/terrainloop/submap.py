@@ -77,7 +77,7 @@ class Submap(ReadOnlyArrays):
         _check_stamp(self.stamp)
         given = _numbers(self.points)
         points = np.array(given, dtype=np.float64)
-        intensity = None if self.intensity is None else _one_a_point(self.intensity, len(points))
+        intensity = None if self.intensity is None else _checked_intensity(self.intensity, len(points))
         rows, repairs = _usable_rows(points)
         rows, strays = _without_strays(points, rows)
         points, repairs = points[rows], repairs + strays
@@ -158,7 +158,7 @@ def _numbers(points: ArrayLike) -> NDArray[np.generic]:
     return array
 
 
-def _one_a_point(values: ArrayLike, count: int) -> Array:
+def _checked_intensity(values: ArrayLike, count: int) -> Array:
     array = np.asarray(values)
     if array.dtype.kind not in "fiu" or array.shape != (count,):
         raise TerrainLoopError(

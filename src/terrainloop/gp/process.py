@@ -142,18 +142,18 @@ class ElevationProcess:
             If the queries do not have that shape, or the equations cannot be solved.
         """
         try:
-            places = np.asarray(queries, dtype=np.float64)
+            positions = np.asarray(queries, dtype=np.float64)
         except (ValueError, TypeError):
-            places = np.empty(0)
-        if places.ndim != 2 or places.shape[1] != 2 or not np.isfinite(places).all():
+            positions = np.empty(0)
+        if positions.ndim != 2 or positions.shape[1] != 2 or not np.isfinite(positions).all():
             raise TerrainLoopError(
                 expected="finite query points of shape (Q, 2), the columns x and y in metres",
-                found=f"shape {places.shape}",
+                found=f"shape {positions.shape}",
                 mend="give one row per point",
             )
-        local = places - self.data.centre[:2]
+        local = positions - self.data.centre[:2]
         solver = exact if self.solver == "exact" else spline
-        with core_errors(f"a prediction at {len(places)} points"):
+        with core_errors(f"a prediction at {len(positions)} points"):
             field = solver.predict_at(*self._training, local, workers=self.workers)
         _add_plane(field, self.data, local[:, 0], local[:, 1])
         return field

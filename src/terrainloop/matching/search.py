@@ -107,8 +107,8 @@ def _distinct_peaks(peaks: Array, *, separation: float, rotations: int, arc: flo
     while len(chosen) < count and surprisals.max(initial=0.0) > 0:
         best = int(surprisals.argmax())
         chosen.append(best)
-        turned = np.abs(rotation - rotation[best])
-        turned = np.minimum(turned, rotations - turned) * arc
+        rotated = np.abs(rotation - rotation[best])
+        rotated = np.minimum(rotated, rotations - rotated) * arc
         shifted = np.hypot(row - row[best], column - column[best])
-        surprisals = np.where(np.maximum(shifted, turned) < separation, 0.0, surprisals)
+        surprisals = np.where(np.maximum(shifted, rotated) < separation, 0.0, surprisals)
     return peaks[:, chosen]

@@ -65,10 +65,10 @@ def figure_map(submap: Submap | None, gradient_map: GradientMap) -> Figure:
         ("(e) gradient along y", gradient_map.gradient_y, "RdBu", "", {"vmin": -steep, "vmax": steep}),
         ("(f) gradient map", gradient_map.magnitude, "gray", "", {"vmin": 0.0, "vmax": steep}),
     ]
-    for place, (title, image, colours, unit, limits) in enumerate(panels, start=2):
-        axes = figure.add_subplot(2, 3, place)
+    for panel, (title, image, colours, unit, limits) in enumerate(panels, start=2):
+        axes = figure.add_subplot(2, 3, panel)
         shown = axes.imshow(image, origin="lower", extent=gradient_map.extent, cmap=colours, **limits)
-        if place > 3:
+        if panel > 3:
             _veil(axes, gradient_map)
         _finish(axes, title)
         figure.colorbar(shown, ax=axes, label=unit)

@@ -87,8 +87,8 @@ def estimate(true: Array, frames_per_submap: int, drift: Drift, rng: Generator) 
     submap = np.arange(len(true)) // frames_per_submap
     tilts = np.radians(drift.gravity_deg) * rng.standard_normal((submap[-1] + 1, 3)) * [1, 1, 0]
     jitter = np.radians(drift.jitter_deg) * rng.standard_normal((len(true), 3))
-    turned = Rotation.from_rotvec(heading_error[:, None] * [0, 0, 1])
-    believed = (turned * Rotation.from_rotvec(tilts[submap])).as_matrix() @ true[:, :3, :3]
+    heading = Rotation.from_rotvec(heading_error[:, None] * [0, 0, 1])
+    believed = (heading * Rotation.from_rotvec(tilts[submap])).as_matrix() @ true[:, :3, :3]
     moved = np.diff(true[:, :3, 3], axis=0)[:, None] @ true[:-1, :3, :3]  # in the body frame
     moved = moved[:, 0] + drift.position * rates[1:, :3] * steps[1:, None]
     body = np.tile(np.eye(4), (len(true), 1, 1))
