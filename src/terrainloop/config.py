@@ -134,6 +134,9 @@ class Calibration(_Frozen):
         0.05, gt=0, description="independent tests per rotation step and squared length scale of shift"
     )
     max_correlation: float = Field(0.999, gt=0, lt=1, description="correlations above it count as this one")
+    null_pairs: int = Field(300, ge=0, description="mirror images compared per mission, about")
+    null_share: float = Field(0.3, gt=0, lt=1, description="share of them that the tail is fitted to")
+    null_prior: int = Field(20, ge=2, description="scores of the law of one pair that are added to theirs")
     # Decision (section 3)
     min_correlation: float = Field(
         0.25, ge=0, lt=1, description="smallest correlation of the fields of a loop closure"

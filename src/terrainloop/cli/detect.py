@@ -80,6 +80,7 @@ def summarise(run: "Run") -> dict[str, Any]:
         "hyperparameters": None if run.parameters is None else asdict(run.parameters),
         "pairs": run.num_pairs,
         "complete": run.complete,
+        "warnings": list(run.warnings),
         "rejections": dict(run.rejections),
         "loops": [loop_to_dict(loop) for loop in run.loops],
         "output": str(run.folder),

@@ -16,6 +16,7 @@ from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.gp.training import TrainingData, detrend
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
+from terrainloop.matching.mission_null import MissionNull, by_mission_null, mirrored
 from terrainloop.matching.register import compare_many
 from terrainloop.record import SubmapRecord
 from terrainloop.resources import check_memory, memory_errors
@@ -24,6 +25,9 @@ from terrainloop.submap import UNNAMED, Submap
 logger = logging.getLogger(__name__)
 
 FEATURE_BYTES_PER_PIXEL = 250  # of SIFT, at the peak (docs/solver.md)
+
+NULL_PAIRS_PER_QUERY = 12  # mirror images compared for one submap, at most
+NEVER_SIGNIFICANT = 1e100  # pairs; mirror images need no thorough refinement
 
 PairSink = Callable[[LoopCandidate], object]
 
@@ -41,6 +45,8 @@ class LoopDetector:
     expected_pairs : int, optional
         Number of pairs that the mission will compare, if known: `max_false_loops` is shared among them.
         Otherwise each query is given less of it than the one before, so that it holds for any number.
+    null_scores : sequence of float, optional
+        Scores of mirror images, where they are known (see `sample_null`); else measured on the way.
     on_pair : callable, optional
         Called with every LoopCandidate as it is decided, rejected ones too; the detector keeps the loops
         only.
@@ -53,6 +59,8 @@ class LoopDetector:
         The submaps stored so far, by id, in the order of arrival.
     loops : list of LoopCandidate
         The accepted loops so far.
+    null_scores : list of float
+        Scores of mirror images, from which the null of the mission is estimated.
 
     Examples
     --------
@@ -69,6 +77,7 @@ class LoopDetector:
         max_false_loops: float | None = None,
         parameters: Hyperparameters | None = None,
         expected_pairs: int | None = None,
+        null_scores: Sequence[float] | None = None,
         on_pair: PairSink = lambda candidate: None,
         workers: int = 1,
     ) -> None:
@@ -84,6 +93,8 @@ class LoopDetector:
         self.workers = workers
         self.entries: dict[str, MapEntry] = {}
         self.loops: list[LoopCandidate] = []
+        self.null_scores: list[float] = list(null_scores or ())
+        self._null_is_known = null_scores is not None
         self._on_pair = on_pair
         self._adding = Lock()
 
@@ -138,12 +149,52 @@ class LoopDetector:
         # `max_false_loops`, all queries together 1.
         pairs = self.expected_pairs or len(stored) ** 2 * (len(stored) + 1)
         candidates = compare_many(query, stored, self.settings, pairs=pairs, workers=self.workers)
+        if self.settings.match.decision == "evidence":
+            null = self._null_with(query, stored)
+            candidates = [by_mission_null(c, null, self.settings, pairs) for c in candidates]
         self.entries[query.id] = query
         for candidate in candidates:
             self._on_pair(candidate)
         loops = [candidate for candidate in candidates if candidate]
         self.loops += loops
         return loops
+
+    def _null_with(self, query: MapEntry, stored: Sequence[MapEntry]) -> MissionNull:
+        """The null of the mission so far; a query adds to it while it is not well known."""
+        wanted = 0 if self._null_is_known else self.settings.calibration.null_pairs
+        if len(self.null_scores) < wanted and stored:
+            sample = stored[:: -(-len(stored) // NULL_PAIRS_PER_QUERY)]
+            self.null_scores += null_scores(query, sample, self.settings, workers=self.workers)
+        return MissionNull.of(self.null_scores, self.settings.calibration)
+
+
+def null_scores(
+    source: MapEntry, targets: Sequence[MapEntry], settings: Settings, *, workers: int = 1
+) -> list[float]:
+    """Scores of the mirror image of a submap against others, by the law of one pair."""
+    image = mirrored(source, settings)
+    candidates = compare_many(image, targets, settings, pairs=NEVER_SIGNIFICANT, workers=workers)
+    return [-candidate.log_nfa for candidate in candidates if not np.isnan(candidate.log_nfa)]
+
+
+def sample_null(
+    entries: Sequence[MapEntry],
+    settings: Settings,
+    *,
+    workers: int = 1,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[float]:
+    """Scores of mirror images for pairs spread evenly over those that a mission compares."""
+    pairs = [(i, j) for i in range(len(entries)) for j in range(i - settings.skip_recent)]
+    count = min(len(pairs), settings.calibration.null_pairs)
+    chosen: dict[int, list[MapEntry]] = {}
+    for k in np.linspace(0, len(pairs) - 1, count).astype(int) if count else ():
+        chosen.setdefault(pairs[k][0], []).append(entries[pairs[k][1]])
+    scores: list[float] = []
+    for done, (i, targets) in enumerate(chosen.items(), start=1):
+        scores += null_scores(entries[i], targets, settings, workers=workers)
+        on_progress(done, len(chosen))
+    return scores
 
 
 def fit_database(

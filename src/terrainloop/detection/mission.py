@@ -11,8 +11,16 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from terrainloop.config import Settings
-from terrainloop.detection.detector import LoopDetector, PairSink, detrend_submap, fit_database, map_submap
+from terrainloop.detection.detector import (
+    LoopDetector,
+    PairSink,
+    detrend_submap,
+    fit_database,
+    map_submap,
+    sample_null,
+)
 from terrainloop.detection.run import Run, RunWriter, Tally
+from terrainloop.detection.sensor_pattern import remove_sensor_pattern
 from terrainloop.detection.workers import map_in_processes
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError, printable
@@ -135,18 +143,26 @@ def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -
         on_pair(candidate)
 
     compared = max(0, len(run.entries) - run.settings.skip_recent)
+    entries, scores = list(run.entries.values()), []
+    if run.settings.match.decision == "evidence":
+        entries, pattern = remove_sensor_pattern(entries, run.settings)
+        if pattern is not None:
+            logger.warning("%s", pattern)
+            run = replace(run, warnings=(str(pattern),))
+        scores = sample_null(entries, run.settings, workers=workers, on_progress=partial(on_progress, "null"))
     detector = LoopDetector(
         run.settings,
         parameters=run.parameters,
         expected_pairs=compared * (compared - 1) // 2,
+        null_scores=scores,
         on_pair=count,
         workers=workers,
     )
     try:
         with threadpool_limits(1, user_api="blas"):
-            for done, entry in enumerate(run.entries.values(), start=1):
+            for done, entry in enumerate(entries, start=1):
                 detector.add_entry(entry)
-                on_progress("pairs", done, len(run.entries))
+                on_progress("pairs", done, len(entries))
     except KeyboardInterrupt:
         logger.warning(
             "interrupted after %d of %d submaps: the result holds only the pairs compared by then",

@@ -55,6 +55,8 @@ class Run:
         Number of rejected pairs, by the first clause of the reason.
     complete : bool
         False where the run was interrupted.
+    warnings : tuple of str
+        What casts doubt on the run, in words.
     entries : mapping of str to MapEntry
         The mapped submaps by id; empty where the run was read from a folder.
     folder : Path or None
@@ -67,6 +69,7 @@ class Run:
     loops: tuple[LoopCandidate, ...]
     rejections: Mapping[str, int] = field(default_factory=dict)
     complete: bool = True
+    warnings: tuple[str, ...] = ()
     entries: Mapping[str, MapEntry] = field(default_factory=dict)
     folder: Path | None = None
 
@@ -123,6 +126,7 @@ class Run:
             loops=loops,
             rejections=about.rejections,
             complete=about.complete,
+            warnings=about.warnings,
             folder=folder,
         )
 
@@ -207,6 +211,7 @@ class _About(BaseModel):
     pairs: int | None = None
     loops: int | None = None
     rejections: dict[str, int] = {}
+    warnings: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, run: Run) -> "_About":
@@ -217,6 +222,7 @@ class _About(BaseModel):
             pairs=run.num_pairs,
             loops=len(run.loops),
             rejections=dict(run.rejections),
+            warnings=run.warnings,
         )
 
     def to_json(self) -> str:

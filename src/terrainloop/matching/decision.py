@@ -150,10 +150,15 @@ def _candidate(pair: Pair, weighed: Weighed, refinement: Refinement | None, obje
 
 
 def _reason(weighed: Weighed, objection: str, allowed: float) -> str:
-    expected = _in_words((weighed.needed - weighed.best.surprisal) / LN_10 + np.log10(allowed))
+    exponent = (weighed.needed - weighed.best.surprisal) / LN_10 + float(np.log10(allowed))
     agreement = weighed.best.agreement
     fit = f"correlation {agreement.correlation:.2f} over {agreement.area:.3g} m^2"
-    reason = f"{expected} false loops expected, {allowed:g} allowed; {fit}"
+    return reason_in_words(objection, exponent, allowed, fit)
+
+
+def reason_in_words(objection: str, log_expected: float, allowed: float, fit: str) -> str:
+    """Why a pair is a loop or not: the objection, the false loops expected (decimal logarithm), the fit."""
+    reason = f"{_in_words(log_expected)} false loops expected, {allowed:g} allowed; {fit}"
     return f"{objection}: {reason}" if objection else reason
 
 
