@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from calibration_util import calibrated, heights_and_slopes
 from conftest import World, flat, map_of, ridges
+from test_mission_null import NULL_MUTANTS
 
 from terrainloop.config import Calibration, Settings
 from terrainloop.geometry import se2
@@ -256,4 +257,5 @@ def test_without_keypoints_nothing_is_proposed_where_the_search_does_not(constan
 
 def test_every_constant_is_moved():
     moved = {constant for _, constant, _ in MUTANTS + SCENE_MUTANTS} | set(OF_KEYPOINTS)
+    moved |= {constant for constant, _ in NULL_MUTANTS}
     assert moved == set(Calibration.model_fields)

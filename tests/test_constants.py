@@ -15,8 +15,9 @@ from terrainloop.config import Calibration
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "calibration.md"
 PACKAGE = Path(terrainloop.__file__).parent
+DETECTION = ("detection/mission", "detection/detector", "detection/sensor_pattern")
 # Where any number changes results. Limits on input, formats and drawings are not of that kind.
-PYTHON = ("features", "field", "gradient_map", "loop", "matching", "gp", "detection/mission", "evaluation")
+PYTHON = ("features", "field", "gradient_map", "loop", "matching", "gp", *DETECTION, "evaluation")
 CORE = ("cpp/src", "cpp/include")
 
 

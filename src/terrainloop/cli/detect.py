@@ -120,6 +120,8 @@ def show(console: Console, run: "Run") -> None:
         if record.status == "broken":
             console.print(f"  left out {printable(f'{record.name}: {record.notes}')}")
     repaired = sum(bool(record.notes) for record in usable)
+    for words in run.warnings:
+        console.print(f"Warning: {words}.")
     if repaired:
         console.print(f"  {count_of(repaired, 'submap')} with repairs or warnings: see notes in submaps.csv")
     console.print(

@@ -17,6 +17,7 @@ from terrainloop.entry import MapEntry
 from terrainloop.geometry import Array
 
 MIN_SUBMAPS = 4  # that a mean is taken of
+MIN_COVER = 0.67  # of the submaps that see a pixel: fewer, and the frame is that of the ground
 MIN_SHARE = 0.05  # of the gradients' energy: less does no harm (docs/matching.md, section 3)
 SIGNIFICANT = 5.0  # standard deviations of the mean squared significance
 WINDOW = 2.0  # length scales over which the significance of the mean is averaged
@@ -114,7 +115,7 @@ def remove_sensor_pattern(
 
 def _pattern(stack: _Stack, pixels_per_length_scale: float) -> SensorPattern | None:
     """The pattern, if what the submaps have in common is more than chance and more than negligible."""
-    seen = stack.count >= MIN_SUBMAPS
+    seen = stack.count >= max(MIN_SUBMAPS, MIN_COVER * len(stack.places))
     n = stack.count[seen]
     if not n.size:
         return None
