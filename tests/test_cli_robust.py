@@ -184,13 +184,16 @@ def start_detect(many, output, config):
     )
 
 
+LAST_BEFORE_PAIRS = "mirror images compared"
+
+
 def interrupt(process, after, number, *, group):
     """Signal once stderr has the text; gives stdout, and the lines of stderr after the signal."""
     with process:
         try:
             assert any(after in line for line in process.stderr)
-            if "cloud_23" in after:
-                time.sleep(0.5)  # into the pairs
+            if after == LAST_BEFORE_PAIRS:
+                time.sleep(0.5)
             (os.killpg if group else os.kill)(process.pid, number)
             out, err = process.communicate(timeout=60)
         finally:
@@ -222,7 +225,7 @@ def test_interrupted_among_the_maps(many, config, tmp_path, number, group):
 def test_interrupted_among_the_pairs(many, config, tmp_path, number, group):
     output = tmp_path / "out"
     process = start_detect(many, output, config)
-    out, lines = interrupt(process, "cloud_23", number, group=group)
+    out, lines = interrupt(process, LAST_BEFORE_PAIRS, number, group=group)
     assert process.returncode == 128 + number
     (line,) = lines
     assert line.startswith("warning: interrupted after ")

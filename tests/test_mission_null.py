@@ -144,6 +144,12 @@ def test_what_it_does_not_explain_stays_a_loop(candidate):
     assert np.array_equal(decided.covariance, np.eye(6))
 
 
+def test_it_says_what_chance_does():
+    null = MissionNull(threshold=2.0, share=0.5, scale=1.5)
+    (score,) = (float(word) for word in str(null).split()[-1:])
+    assert null.log_nfa(score) == pytest.approx(-3.0, abs=0.02)
+
+
 def test_no_null_makes_a_pair_more_significant(candidate):
     generous = MissionNull(threshold=-30.0, share=1e-3, scale=0.44)
     assert by_mission_null(candidate, generous, Settings(), 10).log_nfa == -9.0

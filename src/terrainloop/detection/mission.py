@@ -28,6 +28,7 @@ from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.gp.training import TrainingData
 from terrainloop.io.missions import Mission, load_mission
 from terrainloop.loop import LoopCandidate
+from terrainloop.matching.mission_null import MissionNull
 from terrainloop.record import SubmapRecord
 from terrainloop.resources import available_memory, usable_workers
 from terrainloop.submap import Submap
@@ -150,6 +151,8 @@ def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -
             logger.warning("%s", pattern)
             run = replace(run, warnings=(str(pattern),))
         scores = sample_null(entries, run.settings, workers=workers, on_progress=partial(on_progress, "null"))
+        null = MissionNull.of(scores, run.settings.calibration)
+        logger.info("%d mirror images compared; %s", len(scores), null)
     detector = LoopDetector(
         run.settings,
         parameters=run.parameters,

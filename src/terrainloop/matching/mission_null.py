@@ -74,6 +74,10 @@ class MissionNull:
         excess = float((ordered[:above] - threshold).sum() / (above - 1))
         return cls(float(threshold), above / len(ordered), max(excess, 1.0 / LN_10))
 
+    def __str__(self) -> str:
+        in_thousand = self.threshold + self.scale * np.log(1e3 * self.share)
+        return f"by chance, one pair in a thousand has a score above {in_thousand:.1f}"
+
     def log_nfa(self, score: float) -> float:
         """Decimal logarithm of the number of false alarms in one pair, at a score by the law of one pair."""
         return float(np.log10(self.share) - (score - self.threshold) / (self.scale * LN_10))
