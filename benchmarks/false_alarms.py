@@ -33,7 +33,7 @@ from terrainloop.evaluation.pairs import evaluate_pairs
 from terrainloop.evaluation.truth import GroundTruth
 from terrainloop.io.trajectories import read_trajectory
 from terrainloop.simulation.names import WORLDS
-from terrainloop.simulation.places import simulate_places, write_places
+from terrainloop.simulation.places import APART, simulate_places, write_places
 from terrainloop.simulation.sensors import SpinningLidar, StereoCamera, Survey
 from terrainloop.simulation.setups import SETUPS
 
@@ -112,24 +112,29 @@ def decide(job):
     with TemporaryDirectory() as folder:
         job.write(Path(folder))
         run = detect_mission(folder, SETTINGS, on_pair=pairs.append)
-        truth = read_trajectory(Path(folder) / "truth.tum").poses if job.revisits else None
-    place = {record.name: index // (1 + job.revisits) for index, record in enumerate(run.submaps)}
+        poses = read_trajectory(Path(folder) / "truth.tum").poses if job.revisits else None
+    places = (
+        range(len(run.submaps)) if poses is None else np.rint(poses[:, 0, 3] / APART).astype(int).tolist()
+    )
+    place = {record.name: at for record, at in zip(run.submaps, places, strict=True)}
     unrelated = [pair for pair in pairs if place[pair.source] != place[pair.target]]
     result = {
         "scores": [float(pair.score) for pair in unrelated],
         "false": sum(map(bool, unrelated)),
         "broken": sum(record.status == "broken" for record in run.submaps),
     }
-    if truth is not None:
-        revisits = [
-            p
-            for p in evaluate_pairs(pairs, GroundTruth(run.submaps, truth))
-            if place[p.candidate.source] == place[p.candidate.target]
-        ]
-        result["possible"] = job.places
-        result["found"] = sum(bool(p.candidate) and p.pose_is_right for p in revisits)
-        result["wrong"] = sum(bool(p.candidate) and not p.pose_is_right for p in revisits)
+    if poses is not None:
+        accepted = [pair for pair in pairs if pair and place[pair.source] == place[pair.target]]
+        right = sum(pair.pose_is_right for pair in evaluate_pairs(accepted, truth_of(run, poses, places)))
+        result |= {"possible": job.places, "found": right, "wrong": len(accepted) - right}
     return result
+
+
+def truth_of(run, poses, places):
+    """Truth with all first visits before the second ones: consecutive submaps count as connected."""
+    second = [place in places[:index] for index, place in enumerate(places)]
+    order = np.argsort(second, kind="stable")
+    return GroundTruth([run.submaps[index] for index in order], poses[order])
 
 
 def summary(world, sensor, once, twice):

@@ -40,8 +40,8 @@ def test_places_are_independent(world):
 @pytest.mark.parametrize("sensor", ["survey", FRAME])
 def test_revisits_share_the_ground_that_the_truth_says(sensor):
     made = simulate_places("sparse_rocks", 1, 2, sensor, revisits=True)
-    assert made.place == (0, 0, 1, 1)
-    for first, second in ((0, 1), (2, 3)):
+    assert made.place == (0, 1, 0, 1)
+    for first, second in ((0, 2), (1, 3)):
         T_first_second = inverse(made.truth[first]) @ made.truth[second]
         assert np.linalg.norm(T_first_second[:2, 3]) > 0.5
         moved = transform(T_first_second, made.clouds[second])
@@ -63,8 +63,8 @@ def test_the_truth_puts_clouds_on_the_terrain_of_their_place(sensor):
 
 def test_places_repeat_by_seed_whatever_their_number_and_the_visits():
     three, two = simulate_places("ruts", 5, 3), simulate_places("ruts", 5, 2, revisits=True)
-    assert three.clouds[1].tobytes() == two.clouds[2].tobytes()
-    assert three.truth[1].tobytes() == two.truth[2].tobytes()
+    assert three.clouds[1].tobytes() == two.clouds[1].tobytes()
+    assert three.truth[1].tobytes() == two.truth[1].tobytes()
     assert simulate_places("ruts", 6, 1).clouds[0].tobytes() != three.clouds[0].tobytes()
 
 

@@ -31,8 +31,7 @@ class SimulatedPlaces:
     Attributes
     ----------
     clouds : list of array, (N, 3) float32
-        Points of each submap in its gravity-aligned frame, in metres; of revisits, the two of a place follow
-        each other.
+        Points of each submap in its gravity-aligned frame, in metres; second visits after all first ones.
     place : tuple of int
         Index of the place of each submap.
     truth : array, (M, 4, 4)
@@ -79,18 +78,17 @@ def simulate_places(
         Unknown world or sensor, negative seed, or no places.
     """
     setup = checked_setup(sensor, places, seed)
-    clouds, truth, terrains = [], [], []
+    streams = [stream.spawn(3) for stream in SeedSequence(seed).spawn(places)]
+    side = 2 * _reach(setup)
+    terrains = tuple(make_terrain(world, ground, side, setup.terrain_resolution) for ground, *_ in streams)
+    clouds, truth = [], []
+    visits = [(visit, place) for visit in range(1 + revisits) for place in range(places)]
     with ThreadPoolExecutor() as pool:
-        for index, stream in enumerate(SeedSequence(seed).spawn(places)):
-            for_terrain, *for_visits = stream.spawn(3)
-            terrain = make_terrain(world, for_terrain, 2 * _reach(setup), setup.terrain_resolution)
-            terrains.append(terrain)
-            for visit in range(1 + revisits):
-                cloud, T_place_submap = _visit(setup, terrain, visit, for_visits[visit], pool)
-                clouds.append(cloud)
-                truth.append(translation([index * APART, 0.0, 0.0]) @ T_place_submap)
-    place = tuple(index // (1 + revisits) for index in range(len(clouds)))
-    return SimulatedPlaces(clouds, place, np.stack(truth), tuple(terrains))
+        for visit, place in visits:
+            cloud, T_place_submap = _visit(setup, terrains[place], visit, streams[place][1 + visit], pool)
+            clouds.append(cloud)
+            truth.append(translation([place * APART, 0.0, 0.0]) @ T_place_submap)
+    return SimulatedPlaces(clouds, tuple(place for _, place in visits), np.stack(truth), terrains)
 
 
 def _reach(setup: Setup) -> float:

@@ -234,7 +234,7 @@ def boxes(rng: Generator, grid: Grid, *, per_area: float, sides: tuple[float, fl
     u, v = _rotated(rng, grid)
     heights = np.zeros((grid.size, grid.size))
     for row, column in rng.integers(0, grid.size, (rng.poisson(per_area * grid.extent**2), 2)):
-        length, width = 0.5 * np.exp(rng.uniform(*np.log(sides), 2))
+        length, width = 0.5 * np.exp(rng.uniform(np.log(sides[0]), np.log(sides[1]), 2))
         inside = (np.abs(u - u[row, column]) < length) & (np.abs(v - v[row, column]) < width)
         heights[inside] = np.maximum(heights[inside], 0.12 * rng.integers(1, 4))
     return heights
