@@ -134,7 +134,6 @@ def test_drift_adds_up_over_the_mission(drive):
     [
         *((world, "stereo") for world in ("etna", "morocco", "mars", "flat", "ripples", "built")),
         ("etna", "lidar"),
-        ("terraces", "lidar"),
     ],
 )
 def test_worlds_and_sensors_make_missions(world, sensor):

@@ -1,4 +1,4 @@
-"""Names that commands take, apart from what they name so that ``--help`` needs not load it."""
+"""Names that commands accept, kept apart so that ``--help`` loads nothing heavy."""
 
 WORLDS = (
     *("etna", "morocco", "mars", "flat", "ripples"),
