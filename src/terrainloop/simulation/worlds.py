@@ -55,42 +55,47 @@ def ripples(rng: Generator, grid: Grid) -> Array:
 # Ground on which unrelated places look alike: few things on smooth ground, and things that repeat.
 
 
+def _smooth(rng: Generator, grid: Grid) -> Array:
+    """Ground that undulates by centimetres over metres and is smooth below."""
+    return relief.power_law(rng, grid, rms=0.03, outer_scale=8.0, exponent=4.0)
+
+
 def craters(rng: Generator, grid: Grid) -> Array:
     """Craters of any size on smooth ground, about three within 10 m."""
-    return flat(rng, grid) + relief.craters(rng, grid, per_area=0.03, diameters=(1.6, 4.0))
+    return _smooth(rng, grid) + relief.craters(rng, grid, per_area=0.03, diameters=(1.6, 4.0))
 
 
 def sparse_rocks(rng: Generator, grid: Grid) -> Array:
     """A few rocks of any size, shape and place on smooth ground."""
-    return flat(rng, grid) + relief.rocks(rng, grid, abundance=0.045, limits=(0.3, 1.0))
+    return _smooth(rng, grid) + relief.rocks(rng, grid, abundance=0.045, limits=(0.3, 1.0))
 
 
 def boulders(rng: Generator, grid: Grid) -> Array:
     """A few boulders of one size, anywhere on smooth ground."""
     centres = relief.scattered(rng, grid, per_area=0.05)
-    return flat(rng, grid) + relief.equal_rocks(grid, centres, diameter=0.7)
+    return _smooth(rng, grid) + relief.equal_rocks(grid, centres, diameter=0.7)
 
 
 def equal_rocks(rng: Generator, grid: Grid) -> Array:
     """Equal rocks on smooth ground, always three in the same triangle."""
     triangle = np.array([[-0.9, -0.5], [0.9, -0.5], [0.4, 0.9]])
     centres = relief.copies(rng, grid, pattern=triangle, spacing=8.0)
-    return flat(rng, grid) + relief.equal_rocks(grid, centres, diameter=0.7)
+    return _smooth(rng, grid) + relief.equal_rocks(grid, centres, diameter=0.7)
 
 
 def lattice(rng: Generator, grid: Grid) -> Array:
     """Equal mounds on a square lattice: every place repeats at every mound."""
-    return flat(rng, grid) + relief.mounds(rng, grid, height=0.08, spacing=1.1, radius=0.17)
+    return _smooth(rng, grid) + relief.mounds(rng, grid, height=0.08, spacing=1.1, radius=0.17)
 
 
 def ruts(rng: Generator, grid: Grid) -> Array:
     """Wheel ruts of one turning radius on smooth ground."""
-    return flat(rng, grid) + relief.ruts(rng, grid, turning_radius=5.0, gauge=1.0, depth=0.06)
+    return _smooth(rng, grid) + relief.ruts(rng, grid, turning_radius=5.0, gauge=1.0, depth=0.06)
 
 
 def polygons(rng: Generator, grid: Grid) -> Array:
     """Patterned ground: polygons of similar size between shallow troughs."""
-    return flat(rng, grid) + relief.polygons(rng, grid, diameter=2.5, depth=0.08, width=0.25)
+    return _smooth(rng, grid) + relief.polygons(rng, grid, diameter=2.5, depth=0.08, width=0.25)
 
 
 def terraces(rng: Generator, grid: Grid) -> Array:
