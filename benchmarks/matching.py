@@ -45,9 +45,10 @@ from terrainloop.io.trajectories import read_trajectory
 from terrainloop.matching import decision, hypotheses, register
 from terrainloop.matching.register import compare, compare_many
 from terrainloop.record import SubmapRecord
-from terrainloop.simulation.missions import SETUPS, _submap
+from terrainloop.simulation.missions import submap_cloud
 from terrainloop.simulation.odometry import estimate, true_poses
 from terrainloop.simulation.paths import revisiting_path
+from terrainloop.simulation.setups import SETUPS
 from terrainloop.simulation.terrain import make_terrain
 
 CACHE = Path.home() / ".cache" / "terrainloop-benchmarks"
@@ -333,7 +334,9 @@ def sensors(_, __):
             with ThreadPoolExecutor() as pool:
                 for i, stream in enumerate(for_sensor.spawn(count)):
                     chosen = slice(i * setup.frames, (i + 1) * setup.frames)
-                    clouds.append(_submap(setup, terrain, true[chosen], frames.local[chosen], stream, pool))
+                    clouds.append(
+                        submap_cloud(setup, terrain, true[chosen], frames.local[chosen], stream, pool)
+                    )
                     kinds.append(kind)
             poses += list(frames.truth[:count])
         submaps = [Submap(points, f"{i:03d}", stamp=float(i)) for i, points in enumerate(clouds)]

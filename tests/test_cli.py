@@ -20,6 +20,7 @@ from terrainloop.cli.terminal import console_of, table_of
 from terrainloop.config import Settings
 from terrainloop.geometry import parameters_of, transform
 from terrainloop.gradient_map import GradientMap
+from terrainloop.simulation.names import SENSORS, WORLDS
 
 COMMANDS = ("demo", "map", "match", "detect", "evaluate", "simulate", "config")
 CONTRACT = [  # DESIGN.md, section 3
@@ -101,6 +102,12 @@ def test_help_of_each_command(ok, command):
 @pytest.mark.parametrize("command", ["map", "match", "detect"])
 def test_help_tells_units(ok, command):
     assert "metres" in in_one_line(ok(command, "--help"))
+
+
+@pytest.mark.parametrize(("command", "names"), [("simulate", (*WORLDS, *SENSORS)), ("demo", WORLDS)])
+def test_help_lists_every_world_and_sensor(ok, command, names):
+    text = ok(command, "--help")
+    assert [name for name in names if name not in text] == []
 
 
 def test_help_loads_nothing_heavy():

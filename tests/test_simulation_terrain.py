@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from terrainloop.errors import TerrainLoopError
+from terrainloop.simulation.names import WORLDS
 from terrainloop.simulation.relief import Grid, craters, power_law, ripples, rock_diameters, rocks
-from terrainloop.simulation.terrain import CEILING_PIXELS, WORLDS, Terrain, make_terrain
+from terrainloop.simulation.terrain import CEILING_PIXELS, Terrain, make_terrain
 
 
 @pytest.mark.parametrize("world", WORLDS)
@@ -16,7 +17,7 @@ def test_same_seed_same_terrain_and_another_seed_another(world):
     assert not np.allclose(first.height, other.height, atol=1e-4)
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", [world for world in WORLDS if world not in ("lattice", "terraces")])
 def test_opposite_borders_do_not_agree(world):
     height = make_terrain(world, 1, 30.0, 0.1).height.astype(float)
     first, second, last = np.diff(height[:, [0, 1, -1]], axis=0).T
@@ -25,7 +26,7 @@ def test_opposite_borders_do_not_agree(world):
 
 
 def test_worlds_have_the_relief_they_are_named_for():
-    rough = {w: np.std(np.diff(make_terrain(w, 2, 30.0, 0.05).height, axis=1)) / 0.05 for w in WORLDS}
+    rough = {w: np.std(np.diff(make_terrain(w, 2, 30.0, 0.05).height, axis=1)) / 0.05 for w in WORLDS[:4]}
     assert rough["flat"] < 0.05 < min(rough["etna"], rough["morocco"], rough["mars"])
     x, y = np.meshgrid(*2 * [np.linspace(-1, 1, 601)])
     height = make_terrain("etna", 2, 30.0, 0.05).height

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from terrainloop.simulation.names import WORLDS
+
 
 @dataclass(frozen=True)
 class Look:
@@ -68,4 +70,4 @@ _SAND = Look(
     rock_tone=(1.0, 0.0),
     sky_light=0.2,
 )
-LOOKS = {"etna": _ETNA, "morocco": _MOROCCO, "mars": _MARS, "flat": _SAND, "ripples": _SAND}
+LOOKS = dict.fromkeys(WORLDS, _SAND) | {"etna": _ETNA, "morocco": _MOROCCO, "mars": _MARS}

@@ -10,8 +10,9 @@ from scipy import ndimage
 
 from reproduce.appearance.ground import Ground, Light, Sun, ground_of, light, stream
 from terrainloop.geometry import Array, transform
-from terrainloop.simulation.missions import SETUPS, SimulatedMission
+from terrainloop.simulation.missions import SimulatedMission
 from terrainloop.simulation.sensors import StereoCamera, cast_rays
+from terrainloop.simulation.setups import SETUPS
 from terrainloop.simulation.terrain import Terrain
 
 STEP = 4  # pixels between the rays that are cast first

@@ -15,10 +15,12 @@ from terrainloop.cli.terminal import (
     Terminal,
     Verbose,
     WorkersOption,
+    alternatives,
     check_folder,
     worker_count,
 )
 from terrainloop.errors import printable
+from terrainloop.simulation.names import WORLDS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,7 +37,7 @@ def command(
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder for the mission and the results.")
     ] = Path("demo"),
-    world: Annotated[str, typer.Option("--world", help="etna, morocco, mars, flat or ripples.")] = "etna",
+    world: Annotated[str, typer.Option("--world", help=f"{alternatives(WORLDS)}.")] = "etna",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the terrain and the drive.")] = 0,
     submaps: Annotated[
         int, typer.Option("--submaps", min=3, help="Number of submaps; with 16 there are loop closures.")

@@ -5,20 +5,21 @@ from typing import Annotated
 
 import typer
 
-from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose, check_folder
+from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose, alternatives, check_folder
 from terrainloop.errors import printable
+from terrainloop.simulation.names import SENSORS, WORLDS
 
 HELP = "Simulate a rover's drive over rough ground: clouds, drifting odometry.tum, truth.tum."
 
 
 def command(
     output: Annotated[Path, typer.Option("-o", "--output", help="Mission folder to write.")],
-    world: Annotated[str, typer.Option("--world", help="etna, morocco, mars, flat or ripples.")] = "etna",
+    world: Annotated[str, typer.Option("--world", help=f"{alternatives(WORLDS)}.")] = "etna",
     seed: Annotated[int, typer.Option("--seed", help="Seed of the terrain and the drive.")] = 0,
     submaps: Annotated[
         int, typer.Option("--submaps", help="Number of submaps; with 16 there are loop closures.")
     ] = 16,
-    sensor: Annotated[str, typer.Option("--sensor", help="stereo or lidar.")] = "stereo",
+    sensor: Annotated[str, typer.Option("--sensor", help=f"{alternatives(SENSORS)}.")] = "stereo",
     as_json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,

@@ -190,6 +190,11 @@ def worker_count(workers: int) -> int:
     return usable_workers(workers or usable)
 
 
+def alternatives(names: Sequence[str]) -> str:
+    """The names in a list whose last one follows an "or"."""
+    return f"{', '.join(names[:-1])} or {names[-1]}"
+
+
 def count_of(number: int, noun: str) -> str:
     """Number and noun, the noun in the plural where it must be."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

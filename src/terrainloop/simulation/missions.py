@@ -12,14 +12,14 @@ from numpy.random import Generator, SeedSequence
 from numpy.typing import NDArray
 
 from terrainloop.errors import TerrainLoopError
-from terrainloop.geometry import se3, transform
+from terrainloop.geometry import transform
 from terrainloop.io.clouds import CLOUD_SUFFIXES, write_cloud
 from terrainloop.io.files import write_whole_text
 from terrainloop.io.staging import errors_naming, publish, staging
 from terrainloop.io.trajectories import Trajectory, write_tum
-from terrainloop.simulation.odometry import Drift, estimate, true_poses
+from terrainloop.simulation.odometry import estimate, true_poses
 from terrainloop.simulation.paths import revisiting_path
-from terrainloop.simulation.sensors import SpinningLidar, StereoCamera
+from terrainloop.simulation.setups import SETUPS, Setup, checked_setup
 from terrainloop.simulation.terrain import Terrain, make_terrain
 from terrainloop.strict_yaml import read_yaml
 
@@ -28,73 +28,6 @@ Array = NDArray[np.float64]
 _DESCRIPTION = "simulation.yaml"
 _TRAJECTORIES = ("odometry.tum", "truth.tum")
 _CLOUDS_ONLY = set(CLOUD_SUFFIXES) - {".txt", ".csv"}  # which beside the folder of clouds are notes
-
-
-@dataclass(frozen=True)
-class Setup:
-    """A sensor on the rover and how submaps are made from its frames; metres and degrees.
-
-    Attributes
-    ----------
-    sensor : StereoCamera or SpinningLidar
-        The sensor.
-    mast : float
-        Height of the sensor above the ground between the wheels.
-    pitch_deg : float
-        Downward pitch of the sensor.
-    submap_length, frame_spacing : float
-        Distance driven in a submap and between two frames.
-    voxel : float
-        Side of the voxels that are thinned to the mean of their points.
-    terrain_resolution : float
-        Node distance of the height field.
-    drift : Drift
-        Errors of the odometry.
-    """
-
-    sensor: StereoCamera | SpinningLidar
-    mast: float
-    pitch_deg: float
-    submap_length: float
-    frame_spacing: float
-    voxel: float
-    terrain_resolution: float
-    drift: Drift
-
-    @property
-    def frames(self) -> int:
-        """Frames in a submap."""
-        return round(self.submap_length / self.frame_spacing)
-
-    @property
-    def T_body_sensor(self) -> Array:
-        """Pose of the sensor on the rover."""
-        return se3(0.0, 0.0, self.mast, 0.0, np.radians(self.pitch_deg), 0.0)
-
-
-SETUPS = {
-    "stereo": Setup(
-        sensor=StereoCamera(),
-        mast=1.1,
-        pitch_deg=20.0,
-        submap_length=7.0,
-        frame_spacing=0.5,
-        voxel=0.035,
-        terrain_resolution=0.035,
-        drift=Drift(),
-    ),
-    "lidar": Setup(
-        sensor=SpinningLidar(),
-        mast=1.5,
-        pitch_deg=0.0,
-        submap_length=25.0,
-        frame_spacing=1.0,
-        voxel=0.10,
-        terrain_resolution=0.05,
-        drift=Drift(position=0.002, heading_deg=0.02),  # scan matching drifts less than stereo
-    ),
-}
-SENSORS = tuple(SETUPS)
 
 
 @dataclass(frozen=True)
@@ -151,13 +84,13 @@ def simulate_mission(
     Parameters
     ----------
     world : str
-        "etna", "morocco", "mars", "flat" or "ripples".
+        One of `names.WORLDS`.
     seed : int
         Not negative.
     submaps : int
         Number of submaps; from about 8 on there are loops, from 16 on in both directions.
     sensor : str
-        "stereo" or "lidar".
+        One of `names.SENSORS`.
     progress : callable, optional
         Called with the number of finished submaps and their total after each.
 
@@ -171,7 +104,7 @@ def simulate_mission(
     TerrainLoopError
         Unknown world or sensor, negative seed, or no submaps.
     """
-    setup = _checked_setup(sensor, submaps, seed)
+    setup = checked_setup(sensor, submaps, seed)
     for_terrain, for_path, for_odometry, for_sensor = SeedSequence(seed).spawn(4)
     length = submaps * setup.submap_length
     path = revisiting_path(np.random.default_rng(for_path), length, setup.frame_spacing)
@@ -183,7 +116,7 @@ def simulate_mission(
     with ThreadPoolExecutor() as pool:
         for i, stream in enumerate(for_sensor.spawn(submaps)):
             chosen = slice(i * setup.frames, (i + 1) * setup.frames)
-            clouds.append(_submap(setup, terrain, true[chosen], frames.local[chosen], stream, pool))
+            clouds.append(submap_cloud(setup, terrain, true[chosen], frames.local[chosen], stream, pool))
             if progress:
                 progress(i + 1, submaps)
     middles = range(setup.frames // 2, len(true), setup.frames)
@@ -194,24 +127,10 @@ def simulate_mission(
     )
 
 
-def _checked_setup(sensor: str, submaps: int, seed: int) -> Setup:
-    if sensor not in SETUPS:
-        raise TerrainLoopError(
-            expected="a sensor out of " + ", ".join(SENSORS), found=repr(sensor), mend="choose one of these"
-        )
-    if submaps < 1:
-        raise TerrainLoopError(
-            expected="at least one submap", found=str(submaps), mend="ask for 1 or more; 16 has loops"
-        )
-    if seed < 0:
-        raise TerrainLoopError(expected="a seed of 0 or more", found=str(seed), mend="drop the sign")
-    return SETUPS[sensor]
-
-
-def _submap(
+def submap_cloud(
     setup: Setup, terrain: Terrain, true: Array, local: Array, stream: SeedSequence, pool: ThreadPoolExecutor
 ) -> NDArray[np.float32]:
-    """Frames seen from the true poses, put together by the estimated ones, thinned."""
+    """Frames seen from the true poses T_world_body, assembled by the estimated T_submap_body, thinned."""
 
     def frame(i: int, rng: Generator) -> Array:
         seen = setup.sensor.observe(terrain, true[i] @ setup.T_body_sensor, rng)

@@ -1,6 +1,6 @@
-"""Building blocks of a height field: power-law noise, wind ripples, craters, channels, rocks.
+"""Building blocks of a height field: noise, ripples, craters, channels, rocks, and shapes that repeat.
 
-Every function returns heights in metres on a square grid (rows = y, columns = x).
+Functions of a grid return heights in metres on its nodes (rows = y, columns = x), unless stated otherwise.
 """
 
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.spatial import KDTree
 
 Array = NDArray[np.float64]
 
@@ -67,18 +68,16 @@ def craters(rng: Generator, grid: Grid, *, per_area: float, diameters: tuple[flo
     Within the rim d ((r/R)^2 - 1); the raised rim decays over a third of the radius.
     """
     heights = np.zeros((grid.size, grid.size))
-    x = np.arange(grid.size) * grid.resolution
     smallest, largest = diameters
     for _ in range(rng.poisson(per_area * grid.extent**2)):
         share = rng.uniform()
         radius = 0.5 / np.sqrt((1 - share) / smallest**2 + share / largest**2)
         depth = 2 * radius * rng.uniform(0.06, 0.12)
-        column, row = rng.uniform(0, grid.extent, 2)
-        across, along = (slice(*np.searchsorted(x, [c - 2 * radius, c + 2 * radius])) for c in (column, row))
-        rho = np.hypot(x[across] - column, (x[along] - row)[:, None]) / radius
+        window, dx, dy = _around(grid, rng.uniform(0, grid.extent, 2), 2 * radius)
+        rho = np.hypot(dx, dy) / radius
         bowl = depth * (np.minimum(rho, 1) ** 2 - 1)
         rim = 0.3 * depth * np.exp(-(((rho - 1) / 0.3) ** 2))
-        heights[along, across] += bowl + rim
+        heights[window] += bowl + rim
     return heights
 
 
@@ -145,6 +144,120 @@ def _add_rocks(rng: Generator, heights: Array, diameters: Array, half_width: int
     row, column = np.broadcast_arrays(row.astype(int), column.astype(int))
     inside = (bump > 0) & (row >= 0) & (row < len(heights)) & (column >= 0) & (column < len(heights))
     np.maximum.at(heights, (row[inside], column[inside]), bump[inside])
+
+
+def scattered(rng: Generator, grid: Grid, *, per_area: float) -> Array:
+    """Points (N, 2) of a Poisson process with so many per square metre, metres from node (0, 0)."""
+    return rng.uniform(0, grid.extent, (rng.poisson(per_area * grid.extent**2), 2))
+
+
+def copies(rng: Generator, grid: Grid, *, pattern: Array, spacing: float) -> Array:
+    """Points (N, 2) of copies of a pattern (K, 2), each rotated at random, metres from node (0, 0).
+
+    There is one copy in each square cell of side ``spacing``, anywhere in the middle half of the cell.
+    """
+    cells = np.arange(int(np.ceil(grid.extent / spacing)) + 1)
+    corners = np.stack(np.meshgrid(cells, cells), axis=-1).reshape(-1, 2) - rng.uniform(0, 1, 2)
+    centres = spacing * (corners + rng.uniform(0.25, 0.75, corners.shape))
+    heading = rng.uniform(0, 2 * np.pi, len(centres))
+    cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
+    x, y = pattern.T
+    rotated = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+    return np.asarray((centres[:, None] + rotated).reshape(-1, 2))
+
+
+def equal_rocks(grid: Grid, centres: Array, *, diameter: float) -> Array:
+    """Half-buried rocks of one size and shape, hemispheres flattened to 0.8, at centres (N, 2)."""
+    heights, radius = np.zeros((grid.size, grid.size)), 0.5 * diameter
+    for centre in centres:
+        window, dx, dy = _around(grid, centre, radius)
+        dome = 0.8 * np.sqrt(np.clip(radius**2 - dx**2 - dy**2, 0, None))
+        heights[window] = np.maximum(heights[window], dome)
+    return heights
+
+
+def mounds(rng: Generator, grid: Grid, *, height: float, spacing: float, radius: float) -> Array:
+    """Equal Gaussian mounds (standard deviation ``radius``) on the nodes of a square lattice."""
+    u, v = _rotated(rng, grid)
+    du, dv = _from_nearest(u, spacing), _from_nearest(v, spacing)
+    return np.asarray(height * np.exp(-(du**2 + dv**2) / (2 * radius**2)))
+
+
+def ruts(rng: Generator, grid: Grid, *, turning_radius: float, gauge: float, depth: float) -> Array:
+    """Wheel ruts of vehicles that always steer at the same angle, to the left and right in turn.
+
+    At a constant steering angle a vehicle drives along a circle (Wong, Theory of Ground Vehicles, ch. 5).
+    Each track is a chain of half-circles; tracks run side by side without crossing. A wheel leaves a trough
+    as wide as a sixth of the gauge between berms of the soil it displaced.
+    """
+    u, v = _rotated(rng, grid)
+    track_spacing = 2 * (turning_radius + gauge)
+    track = np.rint(v / track_spacing).astype(int)
+    start = rng.uniform(0, 4 * turning_radius, np.ptp(track) + 1)[track - track.min()]
+    v = v - track * track_spacing
+    along = _from_nearest(u + start + 2 * turning_radius * (v < 0), 4 * turning_radius)
+    from_wheel = np.abs(np.abs(np.hypot(along, v) - turning_radius) - 0.5 * gauge) / (gauge / 12)
+    berms = 0.4 * np.exp(-0.5 * ((from_wheel - 2.2) / 0.7) ** 2)
+    return np.asarray(depth * (berms - np.exp(-0.5 * from_wheel**4)))
+
+
+def polygons(rng: Generator, grid: Grid, *, diameter: float, depth: float, width: float) -> Array:
+    """Patterned ground: troughs over thermal-contraction cracks that divide it into polygons.
+
+    Cracks open where the tension of cooling ground is not yet relieved (Lachenbruch, Geol. Soc. Am. Special
+    Paper 70, 1962); the polygons are modelled as Voronoi cells (Cresto Aleina et al., Earth Syst. Dynam. 4,
+    2013), here of one point in each cell of a square lattice of side ``diameter``. Troughs have a Gaussian
+    cross-section of standard deviation ``width`` / 2.
+    """
+    seeds = copies(rng, grid, pattern=np.zeros((1, 2)), spacing=diameter)
+    x = np.arange(grid.size) * grid.resolution
+    nodes = np.stack(np.meshgrid(x, x), axis=-1)
+    distances, members = KDTree(seeds).query(nodes, k=2)
+    between = np.linalg.norm(np.diff(seeds[members], axis=-2)[..., 0, :], axis=-1)
+    from_crack = np.diff(distances**2)[..., 0] / (2 * between)
+    return np.asarray(-depth * np.exp(-0.5 * (from_crack / (0.5 * width)) ** 2))
+
+
+def terraces(rng: Generator, grid: Grid, *, riser: float, tread: float) -> Array:
+    """Stairs: level treads between equal straight risers, each spread over a tenth of a tread."""
+    u, _ = _rotated(rng, grid)
+    stair = np.floor(u / tread)
+    return np.asarray(riser * (stair + np.clip(10 * (u / tread - stair), 0, 1)))
+
+
+def boxes(rng: Generator, grid: Grid, *, per_area: float, sides: tuple[float, float]) -> Array:
+    """Blocks with level tops, straight edges and vertical sides, all parallel, as people build them.
+
+    Their sides are log-uniform between two lengths (metres), so that kerbs and walls are among them; their
+    heights are 1, 2 or 3 courses of 0.12 m.
+    """
+    u, v = _rotated(rng, grid)
+    heights = np.zeros((grid.size, grid.size))
+    for row, column in rng.integers(0, grid.size, (rng.poisson(per_area * grid.extent**2), 2)):
+        length, width = 0.5 * np.exp(rng.uniform(np.log(sides[0]), np.log(sides[1]), 2))
+        inside = (np.abs(u - u[row, column]) < length) & (np.abs(v - v[row, column]) < width)
+        heights[inside] = np.maximum(heights[inside], 0.12 * rng.integers(1, 4))
+    return heights
+
+
+def _around(grid: Grid, centre: Array, reach: float) -> tuple[tuple[slice, slice], Array, Array]:
+    """The nodes within ``reach`` of a centre along x and y, and their offsets from it along x and along y."""
+    x = np.arange(grid.size) * grid.resolution
+    columns, rows = (slice(*np.searchsorted(x, [c - reach, c + reach])) for c in centre)
+    return (rows, columns), x[columns] - centre[0], (x[rows] - centre[1])[:, None]
+
+
+def _rotated(rng: Generator, grid: Grid) -> tuple[Array, Array]:
+    """Coordinates of the nodes in a frame with a random heading and a random origin on the grid."""
+    heading, (x0, y0) = rng.uniform(0, 2 * np.pi), rng.uniform(0, grid.extent, 2)
+    x = np.arange(grid.size) * grid.resolution
+    dx, dy = x - x0, (x - y0)[:, None]
+    return np.cos(heading) * dx + np.sin(heading) * dy, np.cos(heading) * dy - np.sin(heading) * dx
+
+
+def _from_nearest(values: Array, period: float) -> Array:
+    """Signed distance from the nearest multiple of a period."""
+    return np.asarray(values - period * np.rint(values / period))
 
 
 def _padded(grid: Grid) -> int:

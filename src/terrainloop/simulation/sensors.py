@@ -1,7 +1,8 @@
-"""A stereo camera and a spinning LiDAR that look at a height field.
+"""A stereo camera, a spinning LiDAR and an even survey of a height field.
 
-Sensor frames: x forward, y left, z up. Both sensors see by casting rays, so what is behind a rock or
-a crest is missing, as it is for a rover.
+Sensor frames: x forward, y left, z up. Camera and LiDAR see by casting rays, so what lies behind a rock or
+a crest is missing, as it is for a rover. Their errors of calibration, zero by default, are drawn from a seed
+of the sensor's own: they are the same in every frame, and do not average out.
 """
 
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from terrainloop.geometry import inverse, transform
 from terrainloop.simulation.terrain import CEILING_PIXELS, Terrain
 
 Array = NDArray[np.float64]
@@ -114,6 +116,13 @@ class StereoCamera:
         Amplitude of the bias towards whole disparities, in pixels (Shimizu & Okutomi 2001).
     blank : float
         Share of the image without texture, hence without depth.
+    bias : float
+        RMS of an error of the disparity that is the same in every frame, in pixels, as an imperfect
+        rectification leaves it.
+    bias_correlation : float
+        Standard deviation of the Gaussian that smooths it over the image, in pixels.
+    bias_seed : int
+        Another camera, another error.
     """
 
     width: int = 640
@@ -127,6 +136,14 @@ class StereoCamera:
     correlation: float = 5.0
     locking: float = 0.04
     blank: float = 0.06
+    bias: float = 0.0
+    bias_correlation: float = 8.0
+    bias_seed: int = 0
+
+    @property
+    def view_centre(self) -> float:
+        """Distance ahead of the sensor of the middle of what it sees, in metres."""
+        return 0.5 * self.max_range
 
     def observe(self, terrain: Terrain, T_world_sensor: Array, rng: Generator) -> Array:
         """Points (N, 3) that the matcher yields, in the sensor frame (x along the optical axis)."""
@@ -162,7 +179,14 @@ class StereoCamera:
         smooth = self._smooth_field(rng, disparity.shape, self.correlation)
         white = rng.standard_normal(disparity.shape)
         locking = -self.locking * np.sin(2 * np.pi * disparity)
-        return np.asarray(self.smooth_noise * smooth + self.white_noise * white + locking)
+        error = self.smooth_noise * smooth + self.white_noise * white + locking
+        return np.asarray(error + self.disparity_bias() if self.bias else error)
+
+    def disparity_bias(self) -> Array:
+        """Error (rows, columns cast) of the disparity in every frame, in pixels."""
+        shape = self.height, len(range(0, self.width, self.column_step))
+        field = self._smooth_field(np.random.default_rng(self.bias_seed), shape, self.bias_correlation)
+        return self.bias * field
 
     def _blank_areas(self, rng: Generator) -> NDArray[np.bool_]:
         """Where (rows, columns) the image has too little texture to match."""
@@ -203,6 +227,11 @@ class SpinningLidar:
         Greatest distance kept, in metres.
     range_noise : float
         Standard deviation of a distance, in metres.
+    range_bias, elevation_bias_deg : float
+        Standard deviations over the rings of an error of the distance (metres) and of the elevation that
+        is the same in every turn.
+    bias_seed : int
+        Another LiDAR, other errors.
     """
 
     rings: int = 32
@@ -210,18 +239,72 @@ class SpinningLidar:
     azimuth_step_deg: float = 0.3
     max_range: float = 20.0
     range_noise: float = 0.02
+    range_bias: float = 0.0
+    elevation_bias_deg: float = 0.0
+    bias_seed: int = 0
+
+    @property
+    def view_centre(self) -> float:
+        """Distance ahead of the sensor of the middle of what it sees, in metres."""
+        return 0.0
 
     def observe(self, terrain: Terrain, T_world_sensor: Array, rng: Generator) -> Array:
         """Points (N, 3) of one turn, in the sensor frame."""
-        rays = self._rays(rng.uniform(0, np.radians(self.azimuth_step_deg)))
+        first_azimuth = rng.uniform(0, np.radians(self.azimuth_step_deg))
+        range_bias, elevation_bias = self.ring_biases()
+        elevation = np.radians(np.linspace(*self.elevations_deg, self.rings))
+        rays, believed = (self._rays(first_azimuth, e) for e in (elevation + elevation_bias, elevation))
         distances = _returns(terrain, T_world_sensor, rays, self.max_range, rng)
         back = ~np.isnan(distances)
         measured = distances[back] + self.range_noise * rng.standard_normal(back.sum())
-        return np.asarray(measured[:, None] * rays[back])
+        measured += np.repeat(range_bias, len(rays) // self.rings)[back]
+        return np.asarray(measured[:, None] * believed[back])
 
-    def _rays(self, first_azimuth: float) -> Array:
-        """Unit vectors (N, 3) of one turn, in the sensor frame."""
-        elevation = np.radians(np.linspace(*self.elevations_deg, self.rings))[:, None]
+    def ring_biases(self) -> tuple[Array, Array]:
+        """Errors (rings,) of the distance, in metres, and of the elevation, in radians, in every turn."""
+        range_bias, elevation_bias = np.random.default_rng(self.bias_seed).standard_normal((2, self.rings))
+        return self.range_bias * range_bias, np.radians(self.elevation_bias_deg) * elevation_bias
+
+    def _rays(self, first_azimuth: float, elevation: Array) -> Array:
+        """Unit vectors (N, 3) of one turn at elevations (rings,), in the sensor frame."""
+        elevation = elevation[:, None]
         azimuth = first_azimuth + np.radians(np.arange(0, 360, self.azimuth_step_deg))
         x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
         return np.stack([x, y, np.broadcast_to(np.sin(elevation), x.shape)], axis=-1).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Evenly spread points of a square, all equally accurate and none hidden, as a survey yields them.
+
+    Attributes
+    ----------
+    side : float
+        Of the square about the sensor, in metres.
+    points : int
+        How many.
+    noise : float
+        Standard deviation of a height, in metres.
+    """
+
+    side: float = 9.0
+    points: int = 7000
+    noise: float = 0.006
+
+    @property
+    def max_range(self) -> float:
+        """Horizontal distance of the corners, in metres."""
+        return float(self.side / np.sqrt(2))
+
+    @property
+    def view_centre(self) -> float:
+        """Distance ahead of the sensor of the middle of what it sees, in metres."""
+        return 0.0
+
+    def observe(self, terrain: Terrain, T_world_sensor: Array, rng: Generator) -> Array:
+        """Points (N, 3) of the square, in the sensor frame."""
+        level = np.zeros((self.points, 3))
+        level[:, :2] = rng.uniform(-0.5 * self.side, 0.5 * self.side, (self.points, 2))
+        ground = transform(T_world_sensor, level)
+        ground[:, 2] = terrain.height_at(ground[:, :2]) + self.noise * rng.standard_normal(self.points)
+        return transform(inverse(T_world_sensor), ground)

@@ -1,16 +1,17 @@
-"""Bare terrain as a height field, in five worlds."""
+"""Bare terrain as a height field."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.random import Generator, SeedSequence
+from numpy.random import SeedSequence
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from terrainloop.errors import TerrainLoopError
-from terrainloop.simulation.relief import Grid, channels, craters, power_law, ripples, rocks
+from terrainloop.simulation import worlds
+from terrainloop.simulation.names import WORLDS
+from terrainloop.simulation.relief import Grid
 
 Array = NDArray[np.float64]
 
@@ -76,55 +77,6 @@ class Terrain:
 CEILING_PIXELS = 10
 
 
-def _etna(rng: Generator, grid: Grid) -> Array:
-    """Cinder slopes: 4-8 deg, metre-scale undulation, fine roughness, few rocks."""
-    azimuth, steepness = rng.uniform(0, 2 * np.pi), np.tan(np.radians(rng.uniform(4, 8)))
-    x = np.arange(grid.size) * grid.resolution
-    slope: Array = steepness * (np.cos(azimuth) * x + np.sin(azimuth) * x[:, None])
-    undulation = power_law(rng, grid, rms=0.09, outer_scale=9.0, exponent=4.2)
-    cinder = power_law(rng, grid, rms=0.006, outer_scale=0.5, exponent=3.0)
-    return slope + undulation + cinder + rocks(rng, grid, abundance=0.012, limits=(0.08, 0.8))
-
-
-def _morocco(rng: Generator, grid: Grid) -> Array:
-    """A pebble plain: hardly any relief, many small stones, shallow channels."""
-    undulation = power_law(rng, grid, rms=0.025, outer_scale=8.0, exponent=4.2)
-    gravel = power_law(rng, grid, rms=0.004, outer_scale=0.3, exponent=2.6)
-    channel = channels(rng, grid, depth=0.06, width=1.2)
-    return undulation + gravel + channel + rocks(rng, grid, abundance=0.03, limits=(0.06, 0.4))
-
-
-def _mars(rng: Generator, grid: Grid) -> Array:
-    """Wind ripples with defects, rocks, a few craters."""
-    undulation = power_law(rng, grid, rms=0.07, outer_scale=12.0, exponent=4.2)
-    sand = power_law(rng, grid, rms=0.004, outer_scale=0.3, exponent=3.0)
-    cover = 0.5 + 0.5 * np.tanh(power_law(rng, grid, rms=1.0, outer_scale=8.0, exponent=5.0) + 0.6)
-    waves = cover * ripples(rng, grid, height=0.08, wavelength=1.5)
-    holes = craters(rng, grid, per_area=0.003, diameters=(1.5, 8.0))
-    return undulation + sand + waves + holes + rocks(rng, grid, abundance=0.02, limits=(0.08, 0.8))
-
-
-def _flat(rng: Generator, grid: Grid) -> Array:
-    """A playa: millimetres of roughness, less than any of the sensors resolves."""
-    return power_law(rng, grid, rms=0.002, outer_scale=0.5, exponent=2.6)
-
-
-def _ripples(rng: Generator, grid: Grid) -> Array:
-    """Nothing but wind ripples: ground that repeats itself."""
-    sand = power_law(rng, grid, rms=0.004, outer_scale=0.3, exponent=3.0)
-    return sand + ripples(rng, grid, height=0.10, wavelength=1.5)
-
-
-_WORLDS: dict[str, Callable[[Generator, Grid], Array]] = {
-    "etna": _etna,
-    "morocco": _morocco,
-    "mars": _mars,
-    "flat": _flat,
-    "ripples": _ripples,
-}
-WORLDS = tuple(_WORLDS)
-
-
 def make_terrain(world: str, seed: int | SeedSequence, size_m: float, resolution: float) -> Terrain:
     """A square terrain about the world origin.
 
@@ -140,14 +92,14 @@ def make_terrain(world: str, seed: int | SeedSequence, size_m: float, resolution
     Returns
     -------
     Terrain
-        Not periodic within its extent.
+        Not periodic within its extent, unless the world is one that repeats.
 
     Raises
     ------
     TerrainLoopError
         Unknown world, or a size or resolution that is not positive.
     """
-    if world not in _WORLDS:
+    if world not in WORLDS:
         raise TerrainLoopError(
             expected="a world out of " + ", ".join(WORLDS), found=repr(world), mend="choose one of these"
         )
@@ -158,6 +110,6 @@ def make_terrain(world: str, seed: int | SeedSequence, size_m: float, resolution
             mend="give a size of tens of metres and a resolution of centimetres",
         )
     grid = Grid(size=int(np.ceil(size_m / resolution)) + 1, resolution=resolution)
-    height = _WORLDS[world](np.random.default_rng(seed), grid)
+    height = getattr(worlds, world)(np.random.default_rng(seed), grid)
     corner = -0.5 * grid.extent
     return Terrain((height - height.mean()).astype(np.float32), resolution, (corner, corner))
