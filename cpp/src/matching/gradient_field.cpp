@@ -89,7 +89,8 @@ double weighted_mean(const ImageView<float>& image, const std::vector<float>& we
   return total > 0.0 ? sum / total : 0.0;
 }
 
-/// Divides each vector by sqrt(1 + (length / clip)^2), so that no single crest dominates.
+/// Divides each vector by sqrt(1 + (length / clip)^2), so that no single crest dominates, and by the robust
+/// deviation: the search transforms energies and areas together, so they must not differ by much.
 void clip(Field& field, const Calibration& calibration) {
   constexpr double kRayleighMedian = 1.1774100225154747;  // of a vector of two standard normal components
   std::vector<double> lengths;
@@ -103,9 +104,9 @@ void clip(Field& field, const Calibration& calibration) {
   const double robust = std::max({middle / kRayleighMedian, 1e-6 * largest, static_cast<double>(kTiny)});
   for (std::size_t i = 0; i < field.x.size(); ++i) {
     const double excess = std::hypot(field.x[i], field.y[i]) / (calibration.clip * robust);
-    const float factor = static_cast<float>(1.0 / std::sqrt(1.0 + excess * excess));
-    field.x[i] *= factor;
-    field.y[i] *= factor;
+    const double divisor = robust * std::sqrt(1.0 + excess * excess);
+    field.x[i] = static_cast<float>(field.x[i] / divisor);
+    field.y[i] = static_cast<float>(field.y[i] / divisor);
   }
 }
 

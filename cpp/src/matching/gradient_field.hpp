@@ -10,7 +10,7 @@ namespace terrainloop::matching {
 /// A gradient field on a coarse grid: mean subtracted, weighted by its variance, whitened, soft-clipped.
 struct Field {
   int rows, cols;
-  std::vector<float> x, y;    ///< gradient, 0 where the ground was not observed
+  std::vector<float> x, y;    ///< in robust deviations, 0 where the ground was not observed
   std::vector<float> valid;   ///< 1 where it was, else 0
   double origin_x, origin_y;  ///< of pixel (0, 0), metres
   double spacing, length_scale;
