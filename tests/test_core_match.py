@@ -233,13 +233,10 @@ def test_impossible_settings_are_refused():
             _core.match(m, m, **options)
 
 
-@pytest.mark.parametrize("origin", [(0.0, 0.0), UTM], ids=["local", "UTM"])
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (*UTM, 40.0)], ids=["local", "UTM"])
 def test_a_map_from_points_is_that_of_python(origin):
     """On a slope, with spikes that are no terrain."""
-    pose = se3(*origin, 40.0, 0.03, -0.12, 0.5)
-    points = WORLD.observe(pose, (origin[0] + 0.3, origin[1]), seed=3) if not any(origin) else None
-    if points is None:
-        points = WORLD.observe(se3(0, 0, 0, 0.03, -0.12, 0.5), (0.3, 0.0), seed=3) + np.r_[origin, 40.0]
+    points = WORLD.observe(se3(0, 0, 0, 0.03, -0.12, 0.5), (0.3, 0.0), seed=3) + origin
     points[5:25, 2] += 6.0
     p = PARAMETERS
     made = _core.make_gradient_map(

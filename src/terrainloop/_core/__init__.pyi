@@ -195,4 +195,4 @@ def make_gradient_map(
     max_variance_ratio: float = 0.25,
     threads: int = 1,
 ) -> dict[str, Any]:
-    """The map of a cloud (N, 3) that C++ users make (terrainloop/gradient_map.hpp); not used by the library."""
+    """The map of a cloud (N, 3) that C++ users make (terrainloop/gradient_map.hpp); for the tests, too."""
