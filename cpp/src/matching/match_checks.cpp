@@ -28,9 +28,10 @@ bool positive(std::initializer_list<double> values) {
   return true;
 }
 
-bool not_negative(std::initializer_list<double> values) {
+/// Within the range where a calibrated constant makes sense at all, and its arithmetic is that of numbers.
+bool sensible(std::initializer_list<double> values, double lowest) {
   for (const double value : values)
-    if (!(value >= 0.0 && std::isfinite(value))) return false;
+    if (!(value >= lowest && value <= 1e6)) return false;
   return true;
 }
 
@@ -74,15 +75,17 @@ void check_map(const GradientMapView& map, const char* name) {
 void check_settings(const MatchSettings& settings) {
   const Calibration& c = settings.calibration;
   require(positive({settings.pairs, settings.max_false_loops}), "pairs and max_false_loops must be positive");
-  require(positive({c.pixels_per_length_scale, c.blur, c.spectrum_smoothing, c.whitening_floor, c.clip,
+  require(sensible({c.pixels_per_length_scale, c.blur, c.spectrum_smoothing, c.whitening_floor, c.clip,
                     c.rotation_step, c.min_shared_area, c.min_separation, c.peak_threshold, c.wraparound,
                     c.tail, c.independent_tests, c.max_correlation, c.ambiguity_ratio, c.ambiguity_chance,
-                    c.block, c.usual_strain_samples}),
-          "the numbers of the calibration must be positive");
-  require(not_negative({c.min_correlation, c.usual_strain, c.motion_by_strain[0], c.motion_by_strain[1],
-                        c.motion_by_strain[2], c.rotation_by_strain[0], c.rotation_by_strain[1],
-                        c.rotation_by_strain[2]}),
-          "min_correlation and strains must not be negative");
+                    c.block, c.usual_strain_samples},
+                   1e-6),
+          "the numbers of the calibration must be within 1e-6 and 1e6");
+  require(sensible({c.min_correlation, c.usual_strain, c.motion_by_strain[0], c.motion_by_strain[1],
+                    c.motion_by_strain[2], c.rotation_by_strain[0], c.rotation_by_strain[1],
+                    c.rotation_by_strain[2]},
+                   0.0),
+          "min_correlation and strains must be within 0 and 1e6");
   require(c.wraparound <= 1.0 && c.max_correlation < 1.0 && c.min_correlation < 1.0,
           "wraparound must be at most 1, correlations below 1");
   require(c.max_pixels >= 8 && c.candidates >= 1 && c.dense_hypotheses >= 0,

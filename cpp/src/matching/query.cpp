@@ -9,7 +9,7 @@
 namespace terrainloop::matching {
 namespace {
 
-constexpr double kMostRotations = 1e5;
+constexpr double kMostRotations = 2048;  // some times those of the largest field; memory grows with them
 
 /// Multiples of 4 without prime factors beyond 5, at most a quarter apart: Python's FFT_SIZES.
 constexpr int kSizes[] = {32, 40, 48, 60, 64, 80, 96, 120, 128, 160, 192, 240, 256, 320, 384, 480};
