@@ -58,7 +58,8 @@ struct Match {
   std::array<double, 16> T_target_source;
   /// Row-major (6, 6), of (x, y, z, roll, pitch, yaw) with R = Rz Ry Rx, metres and radians, of the transform
   /// between the frames moved to the two origins below: it takes (point of the source - source_origin) to
-  /// (point of the target - target_origin). NaN unless accepted.
+  /// (point of the target - target_origin). NaN where it is not known, as for every
+  /// pair that is rejected.
   std::array<double, 36> covariance;
   /// Zero, or a point near the map where its frame's origin is far away (UTM), metres.
   std::array<double, 3> source_origin, target_origin;
@@ -69,7 +70,8 @@ struct Match {
   double overlap;      ///< intersection over union of the observed areas, 0 to 1
 };
 
-/// Decides whether two maps show the same place. Deterministic, about 0.1 s; uses no other threads.
+/// Decides whether two maps show the same place. Deterministic, within tens of milliseconds for
+/// ordinary maps; starts no threads.
 /// Throws std::invalid_argument for maps and settings that are impossible.
 Match match(const GradientMapView& source, const GradientMapView& target, const MatchSettings& settings = {});
 

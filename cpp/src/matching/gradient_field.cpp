@@ -14,7 +14,7 @@ constexpr float kTiny = std::numeric_limits<float>::min();
 /// Weights of consecutive pixels of a line.
 struct Taps {
   int first;
-  std::vector<double> weights;
+  std::vector<float> weights;
 };
 
 /// Low-pass filter and linear interpolation of a line of pixels at every `step` of them, for each result.
@@ -35,7 +35,8 @@ std::vector<Taps> resampling(int pixels, double step, double blur) {
     const int first = std::max(0, p - reach), last = std::min(pixels - 1, p + 1 + reach);
     lines[i].first = first;
     for (int q = first; q <= last; ++q)
-      lines[i].weights.push_back((here * gaussian(q - p) + next * gaussian(q - p - 1)) / sum);
+      lines[i].weights.push_back(
+          static_cast<float>((here * gaussian(q - p) + next * gaussian(q - p - 1)) / sum));
   }
   return lines;
 }
@@ -52,7 +53,7 @@ std::vector<float> resampled(const std::vector<Taps>& down, const std::vector<Ta
     for (std::size_t col = 0; col < width; ++col) {
       double sum = 0.0;
       for (std::size_t i = 0; i < across[col].weights.size(); ++i)
-        sum += across[col].weights[i] * line[across[col].first + i];
+        sum += static_cast<double>(across[col].weights[i]) * line[across[col].first + i];
       lines[row * width + col] = static_cast<float>(sum);
     }
   }
@@ -60,7 +61,7 @@ std::vector<float> resampled(const std::vector<Taps>& down, const std::vector<Ta
     for (std::size_t col = 0; col < width; ++col) {
       double sum = 0.0;
       for (std::size_t i = 0; i < down[row].weights.size(); ++i)
-        sum += down[row].weights[i] * lines[(down[row].first + i) * width + col];
+        sum += static_cast<double>(down[row].weights[i]) * lines[(down[row].first + i) * width + col];
       image[row * width + col] = static_cast<float>(sum);
     }
   return image;
