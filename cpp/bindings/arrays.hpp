@@ -51,4 +51,7 @@ auto to_numpy(std::vector<T> values, std::initializer_list<std::size_t> shape) {
 /// Functions for matching, added to the module.
 void bind_matching(nb::module_& module);
 
+/// The one call of C++ users, and the making of maps, added to the module.
+void bind_match(nb::module_& module);
+
 }  // namespace terrainloop

@@ -150,4 +150,5 @@ NB_MODULE(TERRAINLOOP_MODULE, module) {
              "length_scale"_a, "variance"_a, "noise"_a, "side"_a, "work"_a, "threads"_a = 1);
   module.def("fast_hessian", &terrainloop::fast_hessian, "image"_a, "filter_size"_a);
   terrainloop::bind_matching(module);
+  terrainloop::bind_match(module);
 }

@@ -158,11 +158,15 @@ def _whitened(x: Image, y: Image, valid: Image, calibration: Calibration) -> tup
 
 
 def _clipped(x: Image, y: Image, valid: Image, calibration: Calibration) -> tuple[Image, Image]:
-    """Each vector divided by sqrt(1 + (length / clip)^2)."""
+    """Vectors in units of their deviation, each divided by sqrt(1 + (length / clip)^2).
+
+    Correlations do not depend on the unit, but the search transforms energies and areas together, in single
+    precision, so both have to be of the same magnitude.
+    """
     length = np.hypot(x, y)
     robust = max(_median(length, valid > 0) / RAYLEIGH_MEDIAN, 1e-6 * float(length.max()), TINY)
-    factor = (1.0 / np.sqrt(1.0 + (length / (calibration.clip * robust)) ** 2)).astype(np.float32)
-    return x * factor, y * factor
+    factor = 1.0 / (robust * np.sqrt(1.0 + (length / (calibration.clip * robust)) ** 2))
+    return x * factor.astype(np.float32), y * factor.astype(np.float32)
 
 
 def _median(values: NDArray[np.floating], mask: NDArray[np.bool_]) -> float:

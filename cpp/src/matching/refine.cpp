@@ -6,6 +6,7 @@
 #include <stdexcept>
 
 #include "../image_checks.hpp"
+#include "../median.hpp"
 #include "interpolate.hpp"
 
 namespace terrainloop::refine {
@@ -87,12 +88,6 @@ class Aligned {
   int step_;
   Lookup lookup_;
 };
-
-double median(std::vector<double> values) {
-  const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
-  std::nth_element(values.begin(), middle, values.end());
-  return values.size() % 2 ? *middle : 0.5 * (*middle + *std::max_element(values.begin(), middle));
-}
 
 /// Inverse variances times Cauchy's weights of the residuals.
 void weigh(Linearised& at, const std::vector<double>& variance) {

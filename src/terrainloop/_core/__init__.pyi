@@ -167,3 +167,32 @@ def settle(
     A map is (gradient x, gradient y, gradient variance, mask as uint8, origin, resolution). None if
     the overlap is too small.
     """
+
+def calibration() -> dict[str, Any]:
+    """The calibration that `match` has in C++, by the names of `terrainloop.config.Calibration`."""
+
+def match(
+    source: tuple[Any, ...],
+    target: tuple[Any, ...],
+    *,
+    pairs: float = 1.0,
+    max_false_loops: float = 0.01,
+    calibration: dict[str, Any] = {},
+) -> dict[str, Any]:
+    """The decision on two maps that C++ users call (terrainloop/match.hpp): `register` without keypoints.
+
+    A map is (elevation, gradient x, gradient y, gradient variance, mask as uint8, origin, resolution, length
+    scale). The tests hold this call and Python together; the library does not use it.
+    """
+
+def make_gradient_map(
+    xyz: NDArray[np.float64],
+    *,
+    length_scale: float,
+    variance: float,
+    noise: float,
+    resolution: float = 0.0,
+    max_variance_ratio: float = 0.25,
+    threads: int = 1,
+) -> dict[str, Any]:
+    """The map of a cloud (N, 3) that C++ users make (terrainloop/gradient_map.hpp); for the tests, too."""

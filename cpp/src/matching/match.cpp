@@ -1,0 +1,171 @@
+#include "terrainloop/match.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+#include <locale>
+#include <optional>
+#include <sstream>
+#include <string>
+#include <vector>
+
+#include "hypotheses.hpp"
+#include "lift.hpp"
+#include "match_checks.hpp"
+#include "refinement.hpp"
+#include "significance.hpp"
+
+namespace terrainloop {
+namespace {
+
+using namespace matching;
+
+constexpr int kRejectedStep = 3;       // every third row and column is enough to show a rejected pair
+constexpr double kNoEvidence = -10.0;  // score of a pair for which no hypothesis could be weighed
+constexpr double kLn10 = 2.302585092994046;
+constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
+
+/// The best hypothesis of a pair among its rivals, and what a loop closure needs.
+struct Weighed {
+  Hypothesis best;                 ///< of the rivals, if there are any
+  std::vector<Hypothesis> rivals;  ///< those whose correlation is high enough
+  double log_tests;                ///< natural logarithm of the number of tests in this pair
+  double needed;  ///< surprisal at which the expected number of false loops is what is allowed, nats
+
+  double log_nfa() const { return (log_tests - best.surprisal) / kLn10; }
+  bool significant() const { return best.surprisal >= needed; }
+};
+
+Weighed weigh(const Pair& pair, const std::vector<Hypothesis>& hypotheses, const MatchSettings& settings) {
+  std::vector<Hypothesis> rivals;
+  for (const Hypothesis& hypothesis : hypotheses)
+    if (hypothesis.agreement.correlation >= settings.calibration.min_correlation)
+      rivals.push_back(hypothesis);
+  const std::vector<Hypothesis>& eligible = rivals.empty() ? hypotheses : rivals;
+  const auto less = [](const Hypothesis& a, const Hypothesis& b) { return a.surprisal < b.surprisal; };
+  const Hypothesis best = *std::max_element(eligible.begin(), eligible.end(), less);
+  const double log_tests = log_num_tests(pair.found.tried, pair.found.surprisals, settings.calibration);
+  return {best, rivals, log_tests, log_tests + std::log(settings.pairs / settings.max_false_loops)};
+}
+
+/// A number with so many significant digits, whatever the program's locale.
+std::string number(double value, int digits) {
+  std::ostringstream text;
+  text.imbue(std::locale::classic());
+  text.precision(digits);
+  text << value;
+  return text.str();
+}
+
+/// Why the best hypothesis is no loop closure, in words; empty if it is one.
+std::string objection_to(const Pair& pair, const Weighed& weighed,
+                         const std::optional<Refinement>& refinement) {
+  const Calibration& calibration = pair.calibration;
+  const Hypothesis& best = weighed.best;
+  const Matrix3d& T = best.T_target_source;
+  if (!weighed.significant()) return "chance explains it";
+  if (weighed.rivals.empty())
+    return "weak agreement, correlation below " + number(calibration.min_correlation, 6);
+  const double rivalling = std::max(calibration.ambiguity_ratio * best.surprisal,
+                                    weighed.log_tests - std::log(calibration.ambiguity_chance));
+  for (const Hypothesis& rival : weighed.rivals)
+    if (rival.surprisal > rivalling && !pair.same_place(rival.T_target_source, T))
+      return "ambiguous, another place fits as well";
+  if (!refinement || !pair.same_place(refinement->T_target_source(), T))
+    return "undetermined, the refinement converges elsewhere";
+  if (refinement->covariance().hasNaN()) return "undetermined, too little ground to determine the pose";
+  for (const Matrix3d& slid : refinement->weakest(calibration.min_separation * pair.source.length_scale))
+    if (pair.weigh(slid).surprisal > rivalling) return "undetermined, the match slides";
+  return "";
+}
+
+/// Ten to a power; nobody needs to know by how much it is below 1e-12.
+std::string power_of_ten(double exponent) {
+  if (exponent < -12) return "below 1e-12";
+  if (-3 < exponent && exponent < 6) return number(std::pow(10.0, exponent), 2);
+  return "1e" + number(std::nearbyint(exponent), 17);
+}
+
+std::string reason(const Weighed& weighed, const std::string& objection, double allowed) {
+  const double exponent = (weighed.needed - weighed.best.surprisal) / kLn10 + std::log10(allowed);
+  const Agreement& agreement = weighed.best.agreement;
+  std::ostringstream correlation;
+  correlation.imbue(std::locale::classic());
+  correlation << std::fixed;
+  correlation.precision(2);
+  correlation << agreement.correlation;
+  return (objection.empty() ? "" : objection + ": ") + power_of_ten(exponent) + " false loops expected, " +
+         number(allowed, 6) + " allowed; correlation " + correlation.str() + " over " +
+         number(agreement.area, 3) + " m^2";
+}
+
+template <std::size_t N, typename Matrix>
+std::array<double, N> row_major(const Matrix& matrix) {
+  std::array<double, N> values;
+  for (std::size_t i = 0; i < N; ++i)
+    values[i] =
+        matrix(static_cast<Eigen::Index>(i) / matrix.cols(), static_cast<Eigen::Index>(i) % matrix.cols());
+  return values;
+}
+
+Match without_transform(const std::string& reason) {
+  Match match{false, reason, {}, {}, {}, {}, kNan, kNan, kNoEvidence, kNan, 0.0};
+  match.T_target_source.fill(kNan);
+  match.covariance.fill(kNan);
+  return match;
+}
+
+/// The decision and the pose in SE(3): the best hypothesis's, without covariance, where it is no loop.
+Match decided(const Pair& pair, const Weighed& weighed, const std::optional<Refinement>& refinement) {
+  const Matrix3d T = refinement ? refinement->T_target_source() : weighed.best.T_target_source;
+  const PlanarPrecision precision =
+      refinement
+          ? PlanarPrecision{refinement->pivot(), refinement->covariance(), refinement->strain_variance()}
+          : PlanarPrecision{transform(T, pair.source_field.centre), Matrix3d::Constant(kNan), 0.0};
+  const Overlay shared = overlay(pair.source, pair.target, T, refinement ? 1 : kRejectedStep);
+  const Anchored source{pair.source, local_origin(pair.source)},
+      target{pair.target, local_origin(pair.target)};
+  const Lifted lifted = lift_to_se3(source, target, shared, T, precision, pair.calibration);
+  Match match{};
+  match.accepted = refinement.has_value();
+  match.T_target_source = row_major<16>(lifted.T_target_source);
+  match.covariance = row_major<36>(lifted.covariance);
+  match.source_origin = row_major<3>(source.local_origin);
+  match.target_origin = row_major<3>(target.local_origin);
+  match.correlation = weighed.best.agreement.correlation;
+  match.area = weighed.best.agreement.area;
+  match.score = weighed.rivals.empty() ? kNoEvidence : -weighed.log_nfa();
+  match.log_nfa = weighed.log_nfa();
+  match.overlap = shared.overlap;
+  return match;
+}
+
+}  // namespace
+
+Match match(const GradientMapView& source, const GradientMapView& target, const MatchSettings& settings) {
+  check_map(source, "source");
+  check_map(target, "target");
+  check_settings(settings);
+  const Calibration& calibration = settings.calibration;
+  const Pair pair(source, target, calibration);
+  if (pair.found.tried == 0.0) {
+    const double area = calibration.min_shared_area * std::pow(pair.length_scale(), 2);
+    return without_transform("too little ground: an overlap of " + number(area, 3) +
+                             " m^2 at a length scale of " + number(pair.length_scale(), 2) + " m is needed");
+  }
+  const std::vector<Hypothesis> hypotheses = pair.propose();
+  if (hypotheses.empty())
+    return without_transform("featureless: the ground has no structure that could agree");
+  const Weighed weighed = weigh(pair, hypotheses, settings);
+  std::optional<Refinement> refinement;
+  if (weighed.significant())
+    refinement = Refinement::of(source, target, weighed.best.T_target_source, calibration, kThorough);
+  const std::string objection = objection_to(pair, weighed, refinement);
+  if (!objection.empty()) refinement.reset();
+  Match found = decided(pair, weighed, refinement);
+  found.reason = reason(weighed, objection, settings.max_false_loops);
+  return found;
+}
+
+}  // namespace terrainloop

@@ -1,0 +1,65 @@
+#include "overlay.hpp"
+
+#include <cmath>
+
+#include "interpolate.hpp"
+
+namespace terrainloop::matching {
+namespace {
+
+constexpr float kWhole = 0.999f;  // of observed ground
+
+double observed_area(const GradientMapView& map) {
+  double count = 0.0;
+  const std::size_t pixels = static_cast<std::size_t>(map.mask.rows) * map.mask.cols;
+  for (std::size_t i = 0; i < pixels; ++i) count += map.mask.data[i];
+  return count * map.resolution * map.resolution;
+}
+
+Matrix3d metres_of(const GradientMapView& map) {
+  return metres_from_pixels(map.origin_x, map.origin_y, map.resolution);
+}
+
+}  // namespace
+
+Overlay overlay(const GradientMapView& source, const GradientMapView& target, const Matrix3d& T_target_source,
+                int step) {
+  const Matrix3d lookup = metres_of(source).inverse() * inverse(T_target_source) * metres_of(target);
+  const Lookup rows = lookup_of(lookup);
+  Overlay shared{};
+  for (int row = 0; row < target.mask.rows; row += step)
+    for (int col = 0; col < target.mask.cols; col += step) {
+      const Place at(rows, col, row);
+      if (!target.mask(row, col) || !(bilinear(source.mask, at) > kWhole)) continue;
+      shared.positions.insert(shared.positions.end(), {target.origin_x + col * target.resolution,
+                                                       target.origin_y + row * target.resolution});
+      shared.source_elevation.push_back(bilinear(source.elevation, at));
+      shared.target_elevation.push_back(target.elevation(row, col));
+    }
+  const double pixel = std::pow(step * target.resolution, 2);
+  const double area = static_cast<double>(shared.source_elevation.size()) * pixel;
+  if (area > 0.0) shared.overlap = area / (observed_area(source) + observed_area(target) - area);
+  return shared;
+}
+
+Agreement agreement_at(const Field& source, const Field& target, const Matrix3d& T_target_source) {
+  const Matrix3d lookup =
+      source.metres_from_pixels().inverse() * inverse(T_target_source) * target.metres_from_pixels();
+  const std::size_t pixels = target.x.size();
+  std::vector<float> images(3 * pixels);
+  turn_field(source.image(source.x), source.image(source.y), source.image(source.valid), lookup_of(lookup),
+             target.rows, target.cols, images.data());
+  double product = 0.0, energy = 0.0, other = 0.0, count = 0.0;
+  for (std::size_t i = 0; i < pixels; ++i) {
+    if (!(images[2 * pixels + i] > 0) || !(target.valid[i] > 0)) continue;
+    const double x = images[i], y = images[pixels + i], u = target.x[i], v = target.y[i];
+    product += u * x + v * y;
+    energy += x * x + y * y;
+    other += u * u + v * v;
+    count += 1.0;
+  }
+  const double scale = std::sqrt(energy * other);
+  return {scale > 0.0 ? product / scale : 0.0, count * target.spacing * target.spacing};
+}
+
+}  // namespace terrainloop::matching
