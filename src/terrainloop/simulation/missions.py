@@ -96,6 +96,9 @@ SETUPS = {
 }
 SENSORS = tuple(SETUPS)
 
+MOST_SUBMAPS = 10_000
+"""Of a simulated mission; the memory for its terrain, which grows with their square, is exceeded before."""
+
 
 @dataclass(frozen=True)
 class SimulatedMission:
@@ -169,7 +172,7 @@ def simulate_mission(
     Raises
     ------
     TerrainLoopError
-        Unknown world or sensor, negative seed, or no submaps.
+        Unknown world or sensor, negative seed, no submaps, or more than fit into the memory.
     """
     setup = _checked_setup(sensor, submaps, seed)
     for_terrain, for_path, for_odometry, for_sensor = SeedSequence(seed).spawn(4)
@@ -202,6 +205,10 @@ def _checked_setup(sensor: str, submaps: int, seed: int) -> Setup:
     if submaps < 1:
         raise TerrainLoopError(
             expected="at least one submap", found=str(submaps), mend="ask for 1 or more; 16 has loops"
+        )
+    if submaps > MOST_SUBMAPS:
+        raise TerrainLoopError(
+            expected=f"at most {MOST_SUBMAPS} submaps", found=str(submaps), mend="simulate several missions"
         )
     if seed < 0:
         raise TerrainLoopError(expected="a seed of 0 or more", found=str(seed), mend="drop the sign")
