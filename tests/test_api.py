@@ -115,3 +115,46 @@ def test_version():
         assert re.fullmatch(r"\d+\.\d+\.\d+.*", tl.__version__)
     except PackageNotFoundError:
         assert tl.__version__ == "unknown"
+
+
+@pytest.mark.parametrize("settings", ["paper", {"seed": 1}, tl.Settings, Path("settings.yaml")])
+def test_what_are_no_settings_is_refused_by_all(settings, world, tmp_path):
+    ground_map = world(0).map()
+    for call in (
+        lambda: tl.register(ground_map, ground_map, settings),
+        lambda: tl.LoopDetector(settings),
+        lambda: tl.detect_mission(tmp_path, settings),
+    ):
+        with pytest.raises(tl.TerrainLoopError, match=r"expected settings; .* pass Settings\(\)"):
+            call()
+
+
+@pytest.mark.parametrize("clouds", [None, 3, iter([]), [], ()])
+def test_what_are_no_clouds_is_refused(clouds):
+    with pytest.raises(tl.TerrainLoopError, match="at least one cloud"):
+        tl.fit_hyperparameters(clouds)
+
+
+@pytest.mark.parametrize("path", [None, 3, b"cloud.ply", ["cloud.ply"]])
+def test_what_is_no_path_is_refused(path):
+    for call in (tl.read_cloud, tl.read_crs, lambda path: tl.write_cloud(path, np.zeros((3, 3)))):
+        with pytest.raises(tl.TerrainLoopError, match="the path of a cloud"):
+            call(path)
+
+
+def test_ragged_lists_and_endless_stamps_are_refused(tmp_path):
+    ragged = [[1.0, 2.0, 3.0], [1.0]]
+    points = np.random.default_rng(0).uniform(0, 10, (200, 3)) * [1, 1, 0.1]
+    for call in (
+        lambda: tl.write_cloud(tmp_path / "cloud.ply", ragged),
+        lambda: tl.Submap(points, intensity=ragged),
+        lambda: tl.Submap(points, stamp=10**400),
+    ):
+        with pytest.raises(tl.TerrainLoopError):
+            call()
+
+
+def test_a_detector_and_a_run_describe_themselves():
+    assert repr(tl.LoopDetector()) == "LoopDetector(0 submaps, 0 loops)"
+    run = tl.Run(settings=tl.Settings(), parameters=None, submaps=(), loops=(), rejections={"flat": 3})
+    assert repr(run) == "Run(0 submaps, 3 pairs, 0 loops)"

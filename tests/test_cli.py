@@ -754,3 +754,12 @@ def test_a_fault_of_ours_ends_with_1():
     assert done.stdout == ""
     assert "fault of ours" in done.stderr
     assert "TypeError" in done.stderr
+
+
+def test_detect_into_the_clouds_of_a_mission(refused, mission_folder, tmp_path):
+    shutil.copytree(mission_folder, tmp_path / "mission")
+    clouds = tmp_path / "mission" / "clouds"
+    before = sorted(clouds.iterdir())
+    error = refused("detect", tmp_path / "mission", "-o", clouds)
+    assert "output folder apart from the clouds" in error
+    assert sorted(clouds.iterdir()) == before

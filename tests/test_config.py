@@ -262,7 +262,7 @@ def test_settings_cannot_be_changed(path, name):
 
 
 def test_unknown_names_in_code_are_refused():
-    with pytest.raises(ValidationError):
+    with pytest.raises(TerrainLoopError, match="sead: extra inputs"):
         Settings(sead=1)
 
 
@@ -295,3 +295,33 @@ def test_the_calibration_is_written_beside_every_result(file):
     file.write_text(changed.to_yaml())
     assert "tail: 0.9" in changed.to_yaml()
     assert Settings.from_yaml(file) == changed
+
+
+@pytest.mark.parametrize(
+    ("section", "given", "named"),
+    [
+        (Settings, {"max_false_loops": 0}, "match.max_false_loops"),
+        (Settings, {"max_false_loops": [1]}, "match.max_false_loops"),
+        (Settings, {"max_false_loops": 0.1, "match": 3}, "match: input"),
+        (Settings, {"map": {"length_scale": -1}}, "map.length_scale"),
+        (Settings, {"seed": 1.5}, "seed"),
+        (MapSettings, {"resolution": 1e300}, "map.resolution"),
+        (MatchSettings, {"decision": "surprise"}, "match.decision"),
+    ],
+)
+def test_impossible_values_in_code_are_refused_by_name(section, given, named):
+    with pytest.raises(TerrainLoopError, match=f"valid settings; found {named}"):
+        section(**given)
+
+
+def test_a_section_that_is_none_is_refused_beside_the_one_knob(tmp_path):
+    path = tmp_path / "settings.yaml"
+    path.write_text("match: 3\nmax_false_loops: 0.5\n")
+    with pytest.raises(TerrainLoopError, match="match: input should be a valid dictionary"):
+        Settings.from_yaml(path)
+
+
+@pytest.mark.parametrize("allowed", [0, -1, float("nan"), float("inf"), 1e300, "many", [1]])
+def test_an_impossible_number_of_false_loops_is_refused(allowed):
+    with pytest.raises(TerrainLoopError, match="positive max_false_loops"):
+        Settings().with_max_false_loops(allowed)

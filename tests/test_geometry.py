@@ -5,6 +5,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import (
     adjoint_se3,
     exp_se3,
@@ -236,3 +237,9 @@ def test_tangent_covariance_whitens_what_was_drawn():
     tangents = np.array([log_se3(inverse(T) @ se3(*draw)) for draw in draws])
     information = np.linalg.inv(tangent_covariance(T, covariance))
     assert np.einsum("ni,ij,nj->n", tangents, information, tangents).mean() == pytest.approx(6, rel=0.05)
+
+
+@pytest.mark.parametrize("order", ["G2O", "GTSAM", "g20", "", None, 0])
+def test_another_order_of_the_tangent_is_refused(order):
+    with pytest.raises(TerrainLoopError, match="'gtsam' or 'g2o'"):
+        tangent_covariance(np.eye(4), np.eye(6), order)

@@ -744,3 +744,10 @@ def test_a_raster_of_heights_is_no_cloud(tmp_path):
     np.savetxt(path, np.random.default_rng(0).normal(size=(150, 200)), delimiter=",")
     with pytest.raises(TerrainLoopError, match="200 numbers per line and no header: a raster"):
         read_cloud(path)
+
+
+@pytest.mark.parametrize("announced", [200, 401])
+def test_laz_with_another_number_of_points_than_announced_is_refused(tmp_path, announced):
+    (tmp_path / "a.laz").write_bytes(_poked(_las("laz", 6), 247, "<Q", announced))
+    with pytest.raises(TerrainLoopError, match="400"):
+        read_cloud(tmp_path / "a.laz")

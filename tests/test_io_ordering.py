@@ -56,6 +56,7 @@ AMBIGUOUS = {
     "hexadecimal": ["9", "a", "10"],
     "padded hexadecimal": ["0f", "10", "1f", "20"],
     "hashes": ["1b2f", "12cc", "e04a"],
+    "counters in letters": ["cloud_z", "cloud_aa", "cloud_ab"],
     "punctuation": ["scan-1", "scan0", "scan1"],
 }
 

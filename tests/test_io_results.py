@@ -1,4 +1,5 @@
 import csv
+import pickle
 from dataclasses import fields
 
 import numpy as np
@@ -252,3 +253,11 @@ def test_a_bad_submap_line_is_named(tmp_path, column, line):
     path.write_text(f"name,stamp,points,status,hull_m,notes\n{line}\n")
     with pytest.raises(TerrainLoopError, match=rf"column {column}; found .*submaps\.csv, line 2;"):
         read_submaps(path)
+
+
+def test_a_candidate_cannot_be_written_to_and_is_one_line():
+    for candidate in (found := _candidates()[0], pickle.loads(pickle.dumps(found))):
+        for name in ("T_target_source", "covariance", "source_origin", "target_origin"):
+            with pytest.raises(ValueError, match="read-only"):
+                getattr(candidate, name)[:] = 0
+        assert repr(candidate).startswith("LoopCandidate('000007' to '000001', accepted: 17 inliers")

@@ -209,3 +209,18 @@ def test_quotes_that_are_not_closed_swallow_no_lines(tmp_path):
 def test_comments_and_blank_lines_within(tmp_path):
     text = _lines(X, Y, Z).replace("\n", "\r\r\n\n # all 1 2 3\n", 50)
     assert np.array_equal(_read(tmp_path, text, "xyz").points, POINTS)
+
+
+@pytest.mark.parametrize("line", ["a,b", "# a remark", '"1,2,3', "1 2"])
+def test_a_search_for_numbers_is_bounded(tmp_path, line):
+    path = tmp_path / "cloud.csv"
+    path.write_text(100_000 * f"{line}\n")
+    with pytest.raises(TerrainLoopError, match="more than 65536 characters above the first line of numbers"):
+        read_cloud(path)
+
+
+def test_a_line_without_end_is_refused(tmp_path):
+    path = tmp_path / "cloud.xyz"
+    path.write_text(100_000 * "1 2 ")
+    with pytest.raises(TerrainLoopError, match="a line of 399999 characters"):
+        read_cloud(path)

@@ -195,3 +195,31 @@ def test_workers_end_with_their_parent_however_that_ends(tmp_path, number, to_gr
     assert parent.returncode == -number
     # The script is no command: Python shows where it was interrupted, once, and the workers are silent.
     assert err.count("Traceback") == (number == signal.SIGINT)
+
+
+KILLED_WHILE_A_WORKER_STARTS = """
+import os, signal, sys, threading, time
+from functools import partial
+from pathlib import Path
+from terrainloop.detection.workers import map_in_processes
+
+def kill_parent():
+    children = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children")
+    while len(children.read_text().split()) < 2:  # the resource tracker is the first
+        time.sleep(0.001)
+    time.sleep(0.02)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+if __name__ == "__main__":
+    threading.Thread(target=kill_parent).start()
+    list(map_in_processes(partial(pow, 2, mod=bytes(5_000_000)), 4, 2, str))
+"""
+
+
+@needs_proc
+def test_a_worker_whose_parent_is_killed_while_it_starts_ends_quietly(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(KILLED_WHILE_A_WORKER_STARTS)
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert not done.stderr

@@ -258,3 +258,16 @@ def test_a_description_of_something_else_makes_nothing_ours(mission, tmp_path, c
     with pytest.raises(TerrainLoopError, match="did not write"):
         write_mission(mission, tmp_path)
     assert len(load_mission(tmp_path)) == 2
+
+
+@pytest.mark.parametrize("submaps", [10_001, 10**8, 10**400])
+def test_more_submaps_than_anyone_simulates_are_refused(submaps):
+    with pytest.raises(TerrainLoopError, match="at most 10000 submaps"):
+        simulate_mission(submaps=submaps)
+
+
+@pytest.mark.parametrize("sensor", ["stereo", "lidar"])
+def test_terrain_beyond_the_memory_is_refused_before_it_is_made(sensor, monkeypatch):
+    monkeypatch.setattr("terrainloop.resources.available_memory", lambda: 1e9)
+    with pytest.raises(TerrainLoopError, match=r"memory for a terrain .* simulate a shorter drive"):
+        simulate_mission(submaps=1000, sensor=sensor)

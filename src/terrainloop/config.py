@@ -1,10 +1,18 @@
 """Settings: few, in metres or dimensionless, derived from one another where possible."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    model_validator,
+)
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.strict_yaml import read_yaml
@@ -14,11 +22,28 @@ _LONGEST_QUOTE = 120  # characters of a file or of a validator's message that an
 
 class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    section: ClassVar[str] = ""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _our_errors(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        try:
+            return handler(data)
+        except ValidationError as error:
+            first = error.errors()[0]
+            names = map(str, (*filter(None, [cls.section]), *first["loc"]))
+            where = "".join(c for c in ".".join(names) if c.isprintable()) or "all of it"
+            raise TerrainLoopError(
+                expected="valid settings",
+                found=f"{where[:_LONGEST_QUOTE]}: {first['msg'].lower()[:_LONGEST_QUOTE]}",
+                mend="see the output of 'terrainloop config'",
+            ) from error
 
 
 class MapSettings(_Frozen):
     """How a gradient map is made from a submap."""
 
+    section = "map"
     solver: Literal["spline", "exact"] = Field(
         "spline", description="spline: every point, in milliseconds; exact: dense, for a few thousand points"
     )
@@ -63,6 +88,7 @@ class MapSettings(_Frozen):
 class FeatureSettings(_Frozen):
     """Keypoints on the gradient map."""
 
+    section = "features"
     kind: Literal["surf", "sift", "orb"] = Field("sift", description="detector and descriptor")
     max_keypoints: int = Field(500, ge=2, le=10**5, description="strongest keypoints kept per map")
 
@@ -70,6 +96,7 @@ class FeatureSettings(_Frozen):
 class MatchSettings(_Frozen):
     """How two maps are compared, and what makes a loop closure."""
 
+    section = "match"
     decision: Literal["evidence", "inliers"] = Field(
         "evidence", description="evidence: number of false alarms; inliers: Algorithm 1 of the paper"
     )
@@ -99,6 +126,7 @@ _Triple = Annotated[tuple[float, float, float], BeforeValidator(_from_list)]  # 
 class Calibration(_Frozen):
     """Measured constants that `max_false_loops` rests on (docs/calibration.md); not meant to be changed."""
 
+    section = "calibration"
     # The gradient field (docs/matching.md, section 1)
     pixels_per_length_scale: float = Field(2.0, gt=0, description="field: pixels per length scale")
     max_pixels: int = Field(96, ge=8, description="field: pixels across; larger maps take twice the spacing")
@@ -184,7 +212,28 @@ class Settings(_Frozen):
         rest = {name: value for name, value in data.items() if name != "max_false_loops"}
         match = rest.get("match", {})
         match = match.model_dump(exclude_unset=True) if isinstance(match, MatchSettings) else match
+        if not isinstance(match, dict):  # refused as such
+            return rest
         return rest | {"match": {**match, "max_false_loops": data["max_false_loops"]}}
+
+    @classmethod
+    def or_default(cls, settings: "Settings | None") -> "Settings":
+        """The settings, or the defaults where there are none.
+
+        Raises
+        ------
+        TerrainLoopError
+            If it is something else, such as the name of a preset.
+        """
+        if settings is None:
+            return cls()
+        if not isinstance(settings, Settings):
+            raise TerrainLoopError(
+                expected="settings",
+                found=f"{settings!r:.300}",
+                mend="pass Settings(), Settings.preset('paper') or Settings.from_yaml(path)",
+            )
+        return settings
 
     def with_max_false_loops(self, allowed: float | None) -> "Settings":
         """The same settings with another `max_false_loops`, or as they are if None.
@@ -196,13 +245,15 @@ class Settings(_Frozen):
         """
         if allowed is None:
             return self
-        if not 0 < allowed < float("inf"):
+        try:
+            match = MatchSettings(**self.match.model_dump() | {"max_false_loops": allowed})
+        except TerrainLoopError as error:
             raise TerrainLoopError(
                 expected="a positive max_false_loops, the expected number of false loops per mission",
                 found=f"{allowed}",
                 mend="give a number such as 0.01",
-            )
-        return self.model_copy(update={"match": self.match.model_copy(update={"max_false_loops": allowed})})
+            ) from error
+        return self.model_copy(update={"match": match})
 
     @classmethod
     def preset(cls, name: str) -> "Settings":
@@ -246,12 +297,10 @@ class Settings(_Frozen):
         content = read_yaml(path)
         try:
             return cls.model_validate({} if content is None else content, strict=True)
-        except ValidationError as error:
-            first = error.errors()[0]
-            where = "".join(c for c in ".".join(map(str, first["loc"])) if c.isprintable()) or "the file"
+        except TerrainLoopError as error:
             raise TerrainLoopError(
                 expected=f"valid settings in {path}",
-                found=f"{where[:_LONGEST_QUOTE]}: {first['msg'].lower()[:_LONGEST_QUOTE]}",
+                found=error.found,
                 mend="start from the output of 'terrainloop config'",
             ) from error
 

@@ -51,6 +51,9 @@ class MapEntry:
             field=field_of(gradient_map, spacing, settings.calibration),
         )
 
+    def __repr__(self) -> str:
+        return f"MapEntry({self.summary})"
+
     @property
     def name(self) -> str:
         """Name of the submap."""

@@ -6,11 +6,13 @@ A tangent vector of SE(3) is (wx, wy, wz, vx, vy, vz), rotation first, and pertu
 frame: T exp(xi). That is GTSAM's convention (``Pose3::Expmap``); g2o files hold the translation first.
 """
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
+
+from terrainloop.errors import TerrainLoopError
 
 Array = NDArray[np.float64]
 
@@ -153,7 +155,16 @@ def tangent_covariance(T: Array, covariance: Array, order: TangentOrder = "gtsam
     -------
     array, (6, 6)
         Covariance of the tangent vector xi in T exp(xi).
+
+    Raises
+    ------
+    TerrainLoopError
+        For another order: rows and columns in the wrong one look just as plausible.
     """
+    if order not in get_args(TangentOrder):
+        raise TerrainLoopError(
+            expected="the order 'gtsam' or 'g2o'", found=f"{order!r:.60}", mend="name one of the two"
+        )
     _, _, _, roll, pitch, _ = parameters_of(T)
     jacobian = np.zeros((6, 6))
     jacobian[:3, 3:] = _body_rates(roll, pitch)

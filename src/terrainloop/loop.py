@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from terrainloop.arrays import ReadOnlyArrays, read_only
 from terrainloop.geometry import TangentOrder, tangent_covariance, translation
 
 NO_EVIDENCE = -10.0
@@ -15,8 +16,8 @@ def _frame_origin() -> NDArray[np.float64]:
     return np.zeros(3)
 
 
-@dataclass(frozen=True, eq=False)
-class LoopCandidate:
+@dataclass(frozen=True, eq=False, repr=False)
+class LoopCandidate(ReadOnlyArrays):
     """A pair of submaps that was compared; truthy where it was accepted as a loop closure.
 
     Attributes
@@ -74,6 +75,10 @@ class LoopCandidate:
     source_origin: NDArray[np.float64] = field(default_factory=_frame_origin)
     target_origin: NDArray[np.float64] = field(default_factory=_frame_origin)
 
+    def __post_init__(self) -> None:
+        for name in ("T_target_source", "covariance", "source_origin", "target_origin"):
+            object.__setattr__(self, name, read_only(np.asarray(getattr(self, name))))
+
     @classmethod
     def without_transform(
         cls, source: str, target: str, reason: str, score: float = NO_EVIDENCE
@@ -95,6 +100,10 @@ class LoopCandidate:
 
     def __bool__(self) -> bool:
         return self.accepted
+
+    def __repr__(self) -> str:
+        verdict = "accepted" if self.accepted else "rejected"
+        return f"LoopCandidate({self.source!r} to {self.target!r}, {verdict}: {self.reason})"
 
     @property
     def T_local(self) -> NDArray[np.float64]:
@@ -118,6 +127,11 @@ class LoopCandidate:
         -------
         array, (6, 6)
             NaN where there is no covariance.
+
+        Raises
+        ------
+        TerrainLoopError
+            For another order.
         """
         covariance = tangent_covariance(self.T_local, self.covariance, order)
         unknown = np.isnan(covariance).any()

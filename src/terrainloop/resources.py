@@ -21,6 +21,8 @@ _VERSIONS = (
     ("memory.limit_in_bytes", "memory.usage_in_bytes", "memory.stat", "total_inactive_file"),
 )
 
+_LESS = "use a coarser resolution, fewer points or fewer workers"
+
 
 def available_memory() -> float:
     """Bytes that this process can still allocate; infinite where the system does not report them.
@@ -68,18 +70,18 @@ def memory_errors(task: str) -> Iterator[None]:
         raise TerrainLoopError(
             expected=f"enough memory for {task}",
             found=f"{_gigabytes(available_memory())} left",
-            mend="use a coarser resolution, fewer points or fewer workers",
+            mend=_LESS,
         ) from error
 
 
-def check_memory(needed: float, task: str, limit: float | None = None) -> None:
+def check_memory(needed: float, task: str, limit: float | None = None, *, mend: str = _LESS) -> None:
     """Refuse a task that needs more bytes than `limit`, or than are available if that is not given."""
     available = available_memory() if limit is None else min(limit, available_memory())
     if needed > available:
         raise TerrainLoopError(
             expected=f"{_gigabytes(needed)} of memory for {task}",
             found=f"{_gigabytes(available)} available",
-            mend="use a coarser resolution, fewer points or fewer workers",
+            mend=mend,
         )
 
 

@@ -3,6 +3,7 @@
 import logging
 import os
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +24,7 @@ MIN_POINTS = 100
 """A 10 x 10 grid: fewer points cannot hold the handful of keypoints that one loop closure needs."""
 
 _FARTHEST = 1e10  # metres; beyond any frame on a planet, even in millimetres: an uninitialised value
+_LATEST = 1e300  # of a stamp; beyond any, even in nanoseconds
 _COARSEST = 5e-3  # metres; coordinates stored in steps above this have lost the shape of the ground
 _ALL_ON_A_LINE = 1e-3  # width over length of a cloud that covers no area
 _LARGEST_SIDE = 2000.0  # metres; submaps are tens to hundreds of metres across ...
@@ -129,7 +131,8 @@ def _check_label(what: str, label: str) -> None:
 
 
 def _check_stamp(stamp: float) -> None:
-    if not isinstance(stamp, (int, float, np.integer, np.floating)) or not np.isfinite(stamp):
+    # Compared, as np.isfinite fails for integers beyond those of NumPy.
+    if not isinstance(stamp, (int, float, np.integer, np.floating)) or not abs(stamp) < _LATEST:
         raise TerrainLoopError(
             expected="a finite number of seconds, or the index, as the stamp",
             found=f"{stamp!r:.60}",
@@ -145,10 +148,7 @@ def _numbers(points: ArrayLike) -> NDArray[np.generic]:
             found=f"the text or path {os.fspath(points)!r:.60}",
             mend="read a file with terrainloop.read_cloud",
         )
-    try:
-        array = np.ma.filled(points, np.nan) if np.ma.isMaskedArray(points) else np.asarray(points)
-    except (TypeError, ValueError, OverflowError):
-        array = np.empty(0, dtype=object)
+    array = as_numbers(points)
     if array.dtype.kind not in "fiu" or array.ndim != 2 or array.shape[1] != 3:
         raise TerrainLoopError(
             expected="numbers of shape (N, 3), the columns x, y and z in metres",
@@ -158,8 +158,16 @@ def _numbers(points: ArrayLike) -> NDArray[np.generic]:
     return array
 
 
+def as_numbers(values: ArrayLike) -> NDArray[Any]:
+    """The values as an array, NaN where masked; of objects where they are none, as nested lists may be."""
+    try:
+        return np.asarray(np.ma.filled(values, np.nan) if np.ma.isMaskedArray(values) else values)
+    except (TypeError, ValueError, OverflowError):
+        return np.empty(0, dtype=object)
+
+
 def _checked_intensity(values: ArrayLike, count: int) -> Array:
-    array = np.asarray(values)
+    array = as_numbers(values)
     if array.dtype.kind not in "fiu" or array.shape != (count,):
         raise TerrainLoopError(
             expected=f"one intensity per point, shape ({count},)",

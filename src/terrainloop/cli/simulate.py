@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose, alternatives, check_folder
+from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose, alternatives, check_folder, count_of
 from terrainloop.errors import printable
 from terrainloop.simulation.names import SENSORS, WORLDS
 
@@ -47,7 +47,7 @@ def command(
     terminal.result(
         summary,
         lambda console: console.print(
-            f"{len(mission.clouds)} submaps, {points:,} points, written to {printable(str(output))}. "
-            f"Next: terrainloop detect {printable(str(output))} -o OUT"
+            f"{count_of(len(mission.clouds), 'submap')}, {points:,} points, "
+            f"written to {printable(str(output))}. Next: terrainloop detect {printable(str(output))} -o OUT"
         ),
     )

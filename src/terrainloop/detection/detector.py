@@ -81,13 +81,7 @@ class LoopDetector:
         on_pair: PairSink = lambda candidate: None,
         workers: int = 1,
     ) -> None:
-        if settings is not None and not isinstance(settings, Settings):
-            raise TerrainLoopError(
-                expected="settings",
-                found=repr(settings),
-                mend="pass Settings(), Settings.preset('paper') or Settings.from_yaml(path)",
-            )
-        self.settings = (settings or Settings()).with_max_false_loops(max_false_loops)
+        self.settings = Settings.or_default(settings).with_max_false_loops(max_false_loops)
         self.parameters = parameters
         self.expected_pairs = expected_pairs
         self.workers = workers
@@ -97,6 +91,9 @@ class LoopDetector:
         self._null_is_known = null_scores is not None
         self._on_pair = on_pair
         self._adding = Lock()
+
+    def __repr__(self) -> str:
+        return f"LoopDetector({len(self.entries)} submaps, {len(self.loops)} loops)"
 
     def add(self, submap: Submap) -> list[LoopCandidate]:
         """Map a submap, compare it with the earlier ones, store it.

@@ -26,7 +26,7 @@ from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError, printable
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.gp.training import TrainingData
-from terrainloop.io.missions import Mission, load_mission
+from terrainloop.io.missions import CLOUDS, Mission, load_mission
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.mission_null import MissionNull
 from terrainloop.record import SubmapRecord
@@ -90,14 +90,15 @@ def detect_mission(
     Raises
     ------
     TerrainLoopError
-        If no cloud can be used.
+        If no cloud can be used, or the output is the folder ``clouds`` of the mission.
     OSError
         If the output cannot be written; it names the folder.
     """
-    settings, workers = settings or Settings(), usable_workers(workers)
+    settings, workers = Settings.or_default(settings), usable_workers(workers)
     mission = mission if isinstance(mission, Mission) else load_mission(mission)
     if output is None:
         return _detect(mission, settings, on_pair, workers, on_progress)
+    _check_apart(Path(output), mission)
     with RunWriter.open(Path(output)) as writer:
 
         def keep(candidate: LoopCandidate) -> None:
@@ -105,6 +106,17 @@ def detect_mission(
             on_pair(candidate)
 
         return writer.finish(_detect(mission, settings, keep, workers, on_progress))
+
+
+def _check_apart(output: Path, mission: Mission) -> None:
+    """Refuse the folder ``clouds`` of a mission, in which tables count as clouds."""
+    folder = mission.files[0].parent.resolve()
+    if folder.name == CLOUDS and output.resolve() == folder:
+        raise TerrainLoopError(
+            expected="an output folder apart from the clouds",
+            found=f"{output}, where tables would be taken for clouds",
+            mend="give another folder, such as the mission's",
+        )
 
 
 def _detect(

@@ -38,7 +38,7 @@ DERIVED = (
 """Files that other commands add; those of an earlier run are stale."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Run:
     """Loop closures found among submaps, with everything that they depend on.
 
@@ -72,6 +72,9 @@ class Run:
     warnings: tuple[str, ...] = ()
     entries: Mapping[str, MapEntry] = field(default_factory=dict)
     folder: Path | None = None
+
+    def __repr__(self) -> str:
+        return f"Run({len(self.submaps)} submaps, {self.num_pairs} pairs, {len(self.loops)} loops)"
 
     @property
     def num_pairs(self) -> int:

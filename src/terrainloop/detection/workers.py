@@ -59,10 +59,12 @@ class _Worker:
     def __init__(self, task: Callable[[int], Any]) -> None:
         context = get_context("spawn")
         self.connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(task, theirs), daemon=True)
+        self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
         try:
             with _interrupts_blocked():
                 self._process.start()
+                # Large arguments of a process end it with a traceback if this one is killed meanwhile.
+                self.connection.send(task)
         finally:
             theirs.close()
         self.index: int | None = None
@@ -182,11 +184,12 @@ def _interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def _serve(task: Callable[[int], Any], tasks: connection.Connection) -> None:
+def _serve(tasks: connection.Connection) -> None:
     """Run tasks with one BLAS thread; what would be logged is in the results."""
     Thread(target=_end_with_parent, daemon=True).start()
     logging.disable()
     with suppress(EOFError, OSError), threadpool_limits(1, user_api="blas"):  # no parent any more
+        task = tasks.recv()
         tasks.send([])
         while True:
             tasks.send([task(tasks.recv())])

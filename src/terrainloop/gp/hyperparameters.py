@@ -138,8 +138,12 @@ def fit_hyperparameters(
     TerrainLoopError
         If there is no cloud or one that is not a submap, or a number is impossible.
     """
-    if len(clouds) == 0:
-        raise TerrainLoopError(expected="at least one cloud", found="none", mend="pass a list of clouds")
+    if not isinstance(clouds, Sequence | np.ndarray) or len(clouds) == 0:
+        raise TerrainLoopError(
+            expected="at least one cloud",
+            found="none" if clouds is None or isinstance(clouds, Sequence) else f"a {type(clouds).__name__}",
+            mend="pass a list of clouds",
+        )
     given = {"length_scale": length_scale, "variance": variance, "noise": noise}
     check_positive(**given)
     check_max_points(max_points=max_points)

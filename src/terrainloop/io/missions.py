@@ -19,6 +19,9 @@ from terrainloop.submap import Submap
 
 logger = logging.getLogger(__name__)
 
+CLOUDS = "clouds"
+"""Folder of a mission in which every file that can be one is a cloud."""
+
 _SIDE_FILES = (".txt", ".csv")  # beside the clouds these hold trajectories and notes
 _SESSION_HEADERS = ("session", "pass")
 _LARGEST_TABLE = 16 << 20  # bytes
@@ -161,7 +164,7 @@ def load_mission(path: str | Path) -> Mission:
 
 
 def _cloud_files(path: Path) -> list[Path]:
-    inside = path / "clouds"
+    inside = path / CLOUDS
     folder = inside if inside.is_dir() else path
     suffixes = [s for s in CLOUD_SUFFIXES if folder == inside or s not in _SIDE_FILES]
     try:

@@ -45,6 +45,7 @@ _DAY_FIRST = (  # 15-01-2024, 15012024
 )
 _SHORT_YEAR = r"(?<!\d)(\d{1,2})([-_.])(\d{1,2})\2(\d\d)(?!\d)"  # 15-01-24, or 24-01-15
 _TWELVE_HOURS = r"(?i)\d *[ap]m(?![a-z])"
+_LETTERS = r"(|.*[^a-z])([a-z]{1,2})"  # a ... z, aa, ab, as spreadsheets count
 _HEXADECIMAL = r"(|.*[^0-9a-f])([0-9a-f]+)"
 
 _TIME_LIKE = 1e8  # from here on a number in a name is a time, not an index
@@ -113,6 +114,7 @@ def _readings(names: Sequence[str], sign: str, minus: str, natural: Key) -> Iter
         ("by the last number alone", _last_numbers(names, sign, natural)),
         ("as a date that begins with the day", _days_first(names)),
         ("as hexadecimal numbers", _hexadecimal(names)),
+        ("as a counter in letters", _letters(names)),
     ):
         if values:
             yield reading, values.__getitem__
@@ -146,6 +148,14 @@ def _hexadecimal(names: Sequence[str]) -> dict[str, Any]:
     if not of_one_name or digits.isdigit() or digits.isalpha():
         return {}
     return {name: int(match[2], 16) for name, match in zip(names, found, strict=True)}
+
+
+def _letters(names: Sequence[str]) -> dict[str, Any]:
+    """The last letters of each name and their number, where the names differ in one or two letters only."""
+    found = [match for name in names if (match := re.fullmatch(_LETTERS, name.casefold()))]
+    if len(found) < len(names) or len({match[1] for match in found}) > 1:
+        return {}
+    return {name: (len(match[2]), match[2]) for name, match in zip(names, found, strict=True)}
 
 
 def _unordered_notation(names: Sequence[str]) -> str:

@@ -39,9 +39,9 @@ def register(
     Raises
     ------
     TerrainLoopError
-        If one of the two is not a gradient map.
+        If one of the two is not a gradient map, or the settings are none.
     """
-    settings = settings or Settings()
+    settings = Settings.or_default(settings)
     for given in (source_map, target_map):
         if not isinstance(given, GradientMap):
             raise TerrainLoopError(

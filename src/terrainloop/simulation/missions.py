@@ -102,7 +102,7 @@ def simulate_mission(
     Raises
     ------
     TerrainLoopError
-        Unknown world or sensor, negative seed, or no submaps.
+        Unknown world or sensor, negative seed, no submaps, or more than fit into the memory.
     """
     setup = checked_setup(sensor, submaps, seed)
     for_terrain, for_path, for_odometry, for_sensor = SeedSequence(seed).spawn(4)

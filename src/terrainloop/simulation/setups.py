@@ -94,6 +94,9 @@ SETUPS = {
 }
 """By name, `names.SENSORS`."""
 
+MOST_SUBMAPS = 10_000
+"""Of a simulated mission; the memory for its terrain, which grows with their square, is exceeded before."""
+
 
 def checked_setup(sensor: str | Setup, submaps: int, seed: int) -> Setup:
     """The setup of a name, or the one given, after checking what a simulation is asked for.
@@ -110,6 +113,10 @@ def checked_setup(sensor: str | Setup, submaps: int, seed: int) -> Setup:
     if submaps < 1:
         raise TerrainLoopError(
             expected="at least one submap", found=str(submaps), mend="ask for 1 or more; 16 has loops"
+        )
+    if submaps > MOST_SUBMAPS:
+        raise TerrainLoopError(
+            expected=f"at most {MOST_SUBMAPS} submaps", found=str(submaps), mend="simulate several missions"
         )
     if seed < 0:
         raise TerrainLoopError(expected="a seed of 0 or more", found=str(seed), mend="drop the sign")

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from terrainloop.errors import TerrainLoopError
+from terrainloop.resources import check_memory
 from terrainloop.simulation import worlds
 from terrainloop.simulation.names import WORLDS
 from terrainloop.simulation.relief import Grid
@@ -77,6 +78,9 @@ class Terrain:
 CEILING_PIXELS = 10
 
 
+_BYTES_PER_NODE = 130  # at the peak
+
+
 def make_terrain(world: str, seed: int | SeedSequence, size_m: float, resolution: float) -> Terrain:
     """A square terrain about the world origin.
 
@@ -97,7 +101,7 @@ def make_terrain(world: str, seed: int | SeedSequence, size_m: float, resolution
     Raises
     ------
     TerrainLoopError
-        Unknown world, or a size or resolution that is not positive.
+        Unknown world, a size or resolution that is not positive, or more nodes than fit into the memory.
     """
     if world not in WORLDS:
         raise TerrainLoopError(
@@ -110,6 +114,11 @@ def make_terrain(world: str, seed: int | SeedSequence, size_m: float, resolution
             mend="give a size of tens of metres and a resolution of centimetres",
         )
     grid = Grid(size=int(np.ceil(size_m / resolution)) + 1, resolution=resolution)
+    check_memory(
+        _BYTES_PER_NODE * grid.size**2,
+        f"a terrain of {grid.size} x {grid.size} nodes",
+        mend="simulate a shorter drive or a coarser terrain",
+    )
     height = getattr(worlds, world)(np.random.default_rng(seed), grid)
     corner = -0.5 * grid.extent
     return Terrain((height - height.mean()).astype(np.float32), resolution, (corner, corner))

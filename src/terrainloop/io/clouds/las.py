@@ -110,13 +110,17 @@ def _check_chunks(path: Path, header: Any) -> None:
         file.seek(start)
         chunks = [chunk_size for _, chunk_size in lazrs.read_chunk_table(file, laszip)]
         start += 8  # behind the position of the table
-        whole = start + sum(chunks) == table
-        for chunk in chunks if header.point_format.id >= _LAYERED else []:
+        whole, points = start + sum(chunks) == table, 0
+        layered = header.point_format.id >= _LAYERED
+        for chunk in chunks if layered else []:
             file.seek(start + laszip.item_size())  # behind the first point: a count, nine layer sizes
-            whole = whole and sum(struct.unpack("<4x9I", file.read(40))) <= chunk
+            count, *layers = struct.unpack("<10I", file.read(40))
+            whole, points = whole and sum(layers) <= chunk, points + count
             start += chunk
     if not whole:
         raise ValueError("chunks that do not fit their layers or the file")
+    if layered:
+        check_count(header.point_count, points)
 
 
 def _chunk_table_start(file: IO[bytes], start: int, size: int) -> int:

@@ -40,14 +40,12 @@ def _read(text: bytes) -> Table:
     if b"\0" in text:
         raise ValueError("bytes that are not text in UTF-8")
     lines = lines_of(text)
-    start = next((i for i, line in enumerate(lines) if _is_row(line)), len(lines))
+    start = _first_row(lines)
     header, body = lines[:start], without_comments(lines[start:])
     if not body:
         raise ValueError("no line of three numbers")
     if header and re.fullmatch(r"[0-9]{1,18}", header[0].strip()):  # PTS
         check_count(int(header.pop(0)), len(body))
-    if sum(map(len, header)) > LONGEST_HEADER:
-        raise ValueError(f"more than {LONGEST_HEADER} characters above the first line of numbers")
     delimiter = _delimiter(body[0])
     if delimiter != "\t":
         body = [line.strip() for line in body]
@@ -61,6 +59,20 @@ def _read(text: bytes) -> Table:
         columns = {"x": 0, "y": 1, "z": 2}
     table = numbers(body, list(columns.values()), width, delimiter)
     return Table(dict(zip(columns, table.T, strict=True)))
+
+
+def _first_row(lines: Sequence[str]) -> int:
+    """Index of the first line of numbers, looked for within bounds: there may be none."""
+    left = LONGEST_HEADER
+    for index, line in enumerate(lines):
+        if len(line) > LONGEST_HEADER:
+            raise ValueError(f"a line of {len(line)} characters")
+        if _is_row(line):
+            return index
+        left -= len(line)
+        if left < 0:
+            raise ValueError(f"more than {LONGEST_HEADER} characters above the first line of numbers")
+    return len(lines)
 
 
 def _delimiter(line: str) -> str | None:
