@@ -32,7 +32,7 @@ class _Frozen(BaseModel):
         except ValidationError as error:
             first = error.errors()[0]
             names = map(str, (*filter(None, [cls.section]), *first["loc"]))
-            where = "".join(c for c in ".".join(names) if c.isprintable()) or "all of it"
+            where = "".join(c for c in ".".join(names) if c.isprintable()) or "at the top level"
             raise TerrainLoopError(
                 expected="valid settings",
                 found=f"{where[:_LONGEST_QUOTE]}: {first['msg'].lower()[:_LONGEST_QUOTE]}",
@@ -227,7 +227,7 @@ class Settings(_Frozen):
         """
         if settings is None:
             return cls()
-        if not isinstance(settings, Settings):
+        if not isinstance(settings, cls):
             raise TerrainLoopError(
                 expected="settings",
                 found=f"{settings!r:.300}",
