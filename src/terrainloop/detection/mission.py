@@ -163,8 +163,9 @@ def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -
             logger.warning("%s", pattern)
             run = replace(run, warnings=(str(pattern),))
         scores = sample_null(entries, run.settings, workers=workers, on_progress=partial(on_progress, "null"))
-        null = MissionNull.of(scores, run.settings.calibration)
-        logger.info("%d mirror images compared; %s", len(scores), null)
+        if scores:
+            null = MissionNull.of(scores, run.settings.calibration)
+            logger.info("%d mirror images compared; %s", len(scores), null)
     detector = LoopDetector(
         run.settings,
         parameters=run.parameters,
