@@ -597,7 +597,7 @@ def test_preset_and_config_together(refused, command, mission_folder, config, tm
 
 
 @pytest.mark.parametrize(
-    ("content", "named"), [("map: [", "YAML"), ("map: {points: 3}", "map.points"), ("- 1", "the file")]
+    ("content", "named"), [("map: [", "YAML"), ("map: {points: 3}", "map.points"), ("- 1", "all of it")]
 )
 def test_bad_yaml(refused, mission_folder, tmp_path, content, named):
     file = tmp_path / "bad.yaml"

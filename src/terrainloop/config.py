@@ -212,7 +212,7 @@ class Settings(_Frozen):
         """
         if settings is None:
             return cls()
-        if not isinstance(settings, Settings):
+        if not isinstance(settings, cls):
             raise TerrainLoopError(
                 expected="settings",
                 found=f"{settings!r:.300}",
