@@ -231,7 +231,9 @@ def test_mission_maps_share_their_hyperparameters(detected):
 def test_mission_reports_its_progress(detected):
     _, stages = detected
     done = [("maps", n, 5) for n in range(1, 6)]
-    done += [("null", n, 2) for n in range(1, 3)]  # two submaps have earlier ones that are not skipped
+    done += [
+        ("mirror images", n, 2) for n in range(1, 3)
+    ]  # two submaps have earlier ones that are not skipped
     assert stages == done + [("pairs", n, 4) for n in range(1, 5)]
 
 

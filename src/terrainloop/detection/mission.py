@@ -162,7 +162,9 @@ def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -
         if pattern is not None:
             logger.warning("%s", pattern)
             run = replace(run, warnings=(str(pattern),))
-        scores = sample_null(entries, run.settings, workers=workers, on_progress=partial(on_progress, "null"))
+        scores = sample_null(
+            entries, run.settings, workers=workers, on_progress=partial(on_progress, "mirror images")
+        )
         if scores:
             null = MissionNull.of(scores, run.settings.calibration)
             logger.info("%d mirror images compared; %s", len(scores), null)

@@ -23,6 +23,7 @@ from terrainloop.submap import Submap
 
 try:
     from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
     from matplotlib.patches import ConnectionPatch
 except ImportError as error:
@@ -32,6 +33,7 @@ except ImportError as error:
 
 SOURCE_COLOUR, TARGET_COLOUR = "#d1495b", "#00798c"
 DRAWN_POINTS = 40_000  # more do not show at this size
+LONG_NUMBER = 1e5  # metres: eastings are too wide for the usual number of ticks
 _CRITERION_STYLES = {  # thinner over thicker, where curves coincide
     "pose": (TARGET_COLOUR, 4.0),
     "overlap and pose": ("#edae49", 2.4),
@@ -71,8 +73,12 @@ def figure_map(submap: Submap | None, gradient_map: GradientMap) -> Figure:
         if panel > 3:
             _veil(axes, gradient_map)
         _finish(axes, title)
-        figure.colorbar(shown, ax=axes, label=unit)
+        _colour_bar(figure, axes, shown, unit)
     return figure
+
+
+def _colour_bar(figure: Figure, axes: Axes, shown: ScalarMappable, unit: str) -> None:
+    figure.colorbar(shown, ax=axes, label=unit).ax.ticklabel_format(useOffset=False)
 
 
 def _draw_cloud(figure: Figure, axes: Axes, submap: Submap) -> None:
@@ -81,7 +87,7 @@ def _draw_cloud(figure: Figure, axes: Axes, submap: Submap) -> None:
     heights: dict[str, Any] = {"c": drawn[:, 2], "cmap": "gist_earth", "vmin": low, "vmax": high}
     dots = axes.scatter(drawn[:, 0], drawn[:, 1], s=0.3, linewidths=0, **heights)
     _finish(axes, "(a) point cloud, height")
-    figure.colorbar(dots, ax=axes, label="m")
+    _colour_bar(figure, axes, dots, "m")
 
 
 def figure_match(source: MapEntry, target: MapEntry, candidate: LoopCandidate, settings: Settings) -> Figure:
@@ -103,6 +109,8 @@ def figure_match(source: MapEntry, target: MapEntry, candidate: LoopCandidate, s
     ):
         _show_magnitude(axes, gradient_map)
         _finish(axes, f"{role} {name}")
+    right.yaxis.tick_right()  # out of the way of the associations
+    right.yaxis.set_label_position("right")
     _draw_associations(figure, left, right, associations, inliers)
     if np.isfinite(T).all():
         _show_overlay(figure.add_subplot(grid[1, 0]), Overlay(source_map, target_map, T))
@@ -274,18 +282,21 @@ def _show_overlay(axes: Axes, overlay: Overlay) -> None:
 
 
 def _show_both(axes: Axes, source_map: GradientMap, target_map: GradientMap, T_planar: Array) -> None:
-    """Both maps' observed areas, the source's moved into the target's frame."""
+    """Observed areas of both maps, that of the source moved into the frame of the target."""
     for gradient_map, T, colour in (
         (target_map, np.eye(3), TARGET_COLOUR),
         (source_map, T_planar, SOURCE_COLOUR),
     ):
-        rows, columns = np.nonzero(gradient_map.mask)
-        step = max(1, len(rows) // DRAWN_POINTS)
-        ground = np.stack([columns, rows], axis=1)[::step] * gradient_map.resolution + gradient_map.origin
-        axes.plot(*transform(T, ground).T, ".", color=colour, markersize=1, alpha=0.25)
+        rows, columns = np.indices(gradient_map.mask.shape)
+        pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2) * gradient_map.resolution
+        x, y = transform(T, pixels + gradient_map.origin).T.reshape(2, *gradient_map.mask.shape)
+        axes.contourf(x, y, gradient_map.mask, levels=[0.5, 1.5], colors=[colour], alpha=0.35)
     _finish(axes, "observed areas: source (red) over target (blue), target frame")
 
 
 def _finish(axes: Axes, title: str) -> None:
     axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    axes.ticklabel_format(style="plain", useOffset=False)
+    if max(map(abs, axes.get_xlim())) >= LONG_NUMBER:
+        axes.locator_params(axis="x", nbins=4)
     axes.set_title(title, fontsize=10, parse_math=False)
