@@ -137,8 +137,14 @@ def test_what_are_no_clouds_is_refused(clouds):
 
 @pytest.mark.parametrize("path", [None, 3, b"cloud.ply", ["cloud.ply"]])
 def test_what_is_no_path_is_refused(path):
-    for call in (tl.read_cloud, tl.read_crs, lambda path: tl.write_cloud(path, np.zeros((3, 3)))):
-        with pytest.raises(tl.TerrainLoopError, match="the path of a cloud"):
+    for call, of in (
+        (tl.read_cloud, "a cloud"),
+        (tl.read_crs, "a cloud"),
+        (lambda path: tl.write_cloud(path, np.zeros((3, 3))), "a cloud"),
+        (tl.GradientMap.load, "a gradient map"),
+        (tl.Run.read, "a run"),
+    ):
+        with pytest.raises(tl.TerrainLoopError, match=f"the path of {of}"):
             call(path)
 
 

@@ -2,7 +2,6 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -166,12 +165,17 @@ def told(monkeypatch):
     return kept
 
 
+def named(mapped, name):
+    entry = mapped["000000"]
+    return replace(entry, record=replace(entry.record, name=name))
+
+
 @pytest.mark.parametrize("skip", [0, 3])
-def test_however_long_it_runs_max_false_loops_is_shared_out_once(told, strict, skip):
+def test_however_long_it_runs_max_false_loops_is_shared_out_once(told, mapped, strict, skip):
     """Each pair may spend 1 / pairs of it; all of them together one whole, and nearly that."""
     detector = LoopDetector(strict.model_copy(update={"skip_recent": skip}), null_scores=[], workers=2)
     for number in range(60):
-        detector.add_entry(SimpleNamespace(id=str(number), name=str(number)))
+        detector.add_entry(named(mapped, str(number)))
     assert [len(pairs) for pairs in told.values()] == list(range(1, 60 - skip))
     assert all(len(set(pairs)) == 1 for pairs in told.values())  # alike for all of a query
     shares = np.array([sum(1 / n for n in pairs) for pairs in told.values()])
@@ -179,10 +183,10 @@ def test_however_long_it_runs_max_false_loops_is_shared_out_once(told, strict, s
     assert (np.diff(shares) < 0).all()
 
 
-def test_expected_pairs_share_max_false_loops_evenly(told, strict):
+def test_expected_pairs_share_max_false_loops_evenly(told, mapped, strict):
     detector = LoopDetector(strict, expected_pairs=77, null_scores=[])
     for number in range(10):
-        detector.add_entry(SimpleNamespace(id=str(number), name=str(number)))
+        detector.add_entry(named(mapped, str(number)))
     assert {n for pairs in told.values() for n in pairs} == {77}
 
 
@@ -275,6 +279,29 @@ def test_the_detector_takes_the_knob(strict):
 def test_what_is_no_settings_is_refused(settings):
     with pytest.raises(TerrainLoopError, match="expected settings"):
         LoopDetector(settings)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("parameters", 3),
+        ("expected_pairs", -1),
+        ("expected_pairs", "many"),
+        ("expected_pairs", 2.5),
+        ("null_scores", [1.0, np.nan]),
+        ("null_scores", "abc"),
+        ("on_pair", 3),
+    ],
+)
+def test_impossible_arguments_are_refused(name, value):
+    expected = "Hyperparameters" if name == "parameters" else name
+    with pytest.raises(TerrainLoopError, match=f"expected.*{expected}"):
+        LoopDetector(**{name: value})
+
+
+def test_what_is_no_entry_is_refused(strict):
+    with pytest.raises(TerrainLoopError, match="expected a MapEntry"):
+        LoopDetector(strict).add_entry(3)
 
 
 @pytest.mark.parametrize("submap", [np.zeros((300, 3)), "a.ply", None])

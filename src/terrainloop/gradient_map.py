@@ -20,7 +20,7 @@ from terrainloop.gp.hyperparameters import FIT_POINTS
 from terrainloop.gp.kernel import Array, Hyperparameters
 from terrainloop.gp.process import MAX_LENGTH_SCALES, ElevationProcess, Solver
 from terrainloop.gp.training import Points, TrainingData
-from terrainloop.io.files import write_whole
+from terrainloop.io.files import as_path, write_whole
 from terrainloop.io.npz import pack, read_member
 from terrainloop.resources import check_memory, memory_errors
 
@@ -302,7 +302,7 @@ class GradientMap(ReadOnlyArrays):
 
     def save(self, path: Path | str) -> None:
         """Write every array and number of the map to an ``.npz`` file, completely or not at all."""
-        write_whole(path, lambda file: file.write(self.to_bytes()))
+        write_whole(as_path(path, "a gradient map"), lambda file: file.write(self.to_bytes()))
 
     @classmethod
     def load(cls, path: Path | str) -> "GradientMap":
@@ -313,10 +313,11 @@ class GradientMap(ReadOnlyArrays):
         TerrainLoopError
             If the file is not such a map, or its content is not valid.
         """
+        path = as_path(path, "a gradient map")
         try:
-            if not Path(path).is_file():
-                raise FileNotFoundError("no file" if not Path(path).exists() else "not a regular file")
-            return cls.from_bytes(Path(path).read_bytes())
+            if not path.is_file():
+                raise FileNotFoundError("no file" if not path.exists() else "not a regular file")
+            return cls.from_bytes(path.read_bytes())
         except OSError as error:
             raise TerrainLoopError(
                 expected=f"a gradient map in {path}", found=str(error), mend=_MAKE_ONE

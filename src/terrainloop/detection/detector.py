@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from numbers import Real
 from threading import Lock
 
 import numpy as np
@@ -82,12 +83,19 @@ class LoopDetector:
         workers: int = 1,
     ) -> None:
         self.settings = Settings.or_default(settings).with_max_false_loops(max_false_loops)
+        known = () if null_scores is None else null_scores
+        _require(isinstance(parameters, Hyperparameters | None), "Hyperparameters or None", parameters)
+        _require(
+            expected_pairs is None or _is_count(expected_pairs), "expected_pairs of 0 or more", expected_pairs
+        )
+        _require(all(map(_is_finite, known)), "finite null_scores", known)
+        _require(callable(on_pair), "a function on_pair", on_pair)
         self.parameters = parameters
         self.expected_pairs = expected_pairs
         self.workers = workers
         self.entries: dict[str, MapEntry] = {}
         self.loops: list[LoopCandidate] = []
-        self.null_scores: list[float] = list(null_scores or ())
+        self.null_scores: list[float] = list(known)
         self._null_is_known = null_scores is not None
         self._on_pair = on_pair
         self._adding = Lock()
@@ -115,10 +123,7 @@ class LoopDetector:
         TerrainLoopError
             If the name is taken or no map can be made; the detector is then as it was.
         """
-        if not isinstance(submap, Submap):
-            raise TerrainLoopError(
-                expected="a Submap", found=f"a {type(submap).__name__}", mend="pass Submap(points, name=...)"
-            )
+        _require(isinstance(submap, Submap), "a Submap", submap)
         with self._adding:
             query = map_submap(submap, self.settings, self.parameters, workers=self.workers)
             if submap.name == UNNAMED:
@@ -131,6 +136,7 @@ class LoopDetector:
 
     def add_entry(self, query: MapEntry) -> list[LoopCandidate]:
         """As `add`, for a submap that is mapped already (see `map_submap`)."""
+        _require(isinstance(query, MapEntry), "a MapEntry", query)
         with self._adding:
             return self._add(query)
 
@@ -163,6 +169,21 @@ class LoopDetector:
             sample = stored[:: -(-len(stored) // NULL_PAIRS_PER_QUERY)]
             self.null_scores += null_scores(query, sample, self.settings, workers=self.workers)
         return MissionNull.of(self.null_scores, self.settings.calibration)
+
+
+def _require(met: bool, expected: str, found: object) -> None:
+    if not met:
+        raise TerrainLoopError(
+            expected=expected, found=f"{found!r:.60}", mend="see the documentation of LoopDetector"
+        )
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int | np.integer) and bool(value >= 0)
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, Real) and bool(np.isfinite(float(value)))
 
 
 def null_scores(

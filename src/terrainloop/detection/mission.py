@@ -26,6 +26,7 @@ from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError, printable
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.gp.training import TrainingData
+from terrainloop.io.files import as_path
 from terrainloop.io.missions import CLOUDS, Mission, load_mission
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.mission_null import MissionNull
@@ -98,8 +99,9 @@ def detect_mission(
     mission = mission if isinstance(mission, Mission) else load_mission(mission)
     if output is None:
         return _detect(mission, settings, on_pair, workers, on_progress)
-    _check_apart(Path(output), mission)
-    with RunWriter.open(Path(output)) as writer:
+    output = as_path(output, "an output folder")
+    _check_apart(output, mission)
+    with RunWriter.open(output) as writer:
 
         def keep(candidate: LoopCandidate) -> None:
             writer.add(candidate)

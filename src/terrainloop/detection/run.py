@@ -15,7 +15,7 @@ from terrainloop.config import Settings
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.kernel import Hyperparameters
-from terrainloop.io.files import write_whole_text
+from terrainloop.io.files import as_path, write_whole_text
 from terrainloop.io.results import (
     LoopFile,
     iterate_loops,
@@ -106,7 +106,7 @@ class Run:
         TerrainLoopError
             If a file is missing or damaged.
         """
-        folder = Path(folder)
+        folder = as_path(folder, "a run")
         missing = [name for name in (LOOPS, PAIRS, SUBMAPS, CONFIG) if not (folder / name).is_file()]
         if missing:
             raise TerrainLoopError(

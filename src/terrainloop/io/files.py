@@ -1,4 +1,4 @@
-"""Files that are written completely or not at all."""
+"""Paths, and files that are written completely or not at all."""
 
 import codecs
 import contextlib
@@ -8,6 +8,23 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, TextIO, cast
+
+from terrainloop.errors import TerrainLoopError
+
+
+def as_path(path: str | os.PathLike[str], of: str) -> Path:
+    """The path of something, such as a cloud.
+
+    Raises
+    ------
+    TerrainLoopError
+        If it is no path.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise TerrainLoopError(
+            expected=f"the path of {of}", found=f"{path!r:.60}", mend="give a text or a pathlib.Path"
+        )
+    return Path(path)
 
 
 def write_whole(path: str | Path, write: Callable[[IO[bytes]], object]) -> None:

@@ -1,6 +1,5 @@
 """Trajectories: poses with stamps, read from TUM and KITTI files and written as TUM."""
 
-import os
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from terrainloop.errors import TerrainLoopError
-from terrainloop.io.files import write_whole
+from terrainloop.io.files import as_path, write_whole
 
 Array = NDArray[np.float64]
 
@@ -94,11 +93,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
         Naming the file, the line and the columns expected. Quaternions and rotation matrices are refused
         where their norms are further from one than rounded digits explain.
     """
-    if not isinstance(path, str | os.PathLike):
-        raise TerrainLoopError(
-            expected="the path of a trajectory", found=f"{path!r:.60}", mend="give a TUM or KITTI file"
-        )
-    path = Path(path)
+    path = as_path(path, "a trajectory")
     lines, table = _table(path)
     translations = table[:, 1:4] if table.shape[1] == _TUM else table[:, 3::4]
     far = np.abs(translations).max(axis=1) > _FARTHEST

@@ -16,7 +16,7 @@ from terrainloop.io.clouds.pcd import read_pcd
 from terrainloop.io.clouds.ply import read_ply
 from terrainloop.io.clouds.table import INTENSITY, Columns, Table, check_points
 from terrainloop.io.clouds.text import read_text
-from terrainloop.io.files import write_whole
+from terrainloop.io.files import as_path, write_whole
 from terrainloop.submap import Submap, as_numbers
 
 logger = logging.getLogger(__name__)
@@ -54,7 +54,7 @@ def read_cloud(path: str | Path, stamp: float = 0.0) -> Submap:
         If anything is wrong with the file, which the error names: damage, coordinates of a LAS or LAZ file
         in degrees or feet, a count in a header that differs from what follows.
     """
-    path = _path(path)
+    path = as_path(path, "a cloud")
     reader = _reader_for(path)
     table = Table({})
     try:
@@ -85,7 +85,7 @@ def read_crs(path: str | Path) -> int | str | None:
     TerrainLoopError
         Naming the file, where it cannot be read.
     """
-    path = _path(path)
+    path = as_path(path, "a cloud")
     _reader_for(path)
     if path.suffix.lower() not in (".las", ".laz"):
         return None
@@ -109,7 +109,7 @@ def write_cloud(path: str | Path, points: ArrayLike) -> None:
     OSError
         Naming `path`, where it cannot be written.
     """
-    path, points = _path(path), as_numbers(points)
+    path, points = as_path(path, "a cloud"), as_numbers(points)
     writer = _WRITERS.get(path.suffix.lower())
     if writer is None:
         raise TerrainLoopError(
@@ -140,14 +140,6 @@ def _damaged(path: Path, error: Exception) -> TerrainLoopError:
         found=f"{path}: {reason}",
         mend="export it again: it is damaged, truncated or of another format than its suffix indicates",
     )
-
-
-def _path(path: str | Path) -> Path:
-    if not isinstance(path, str | os.PathLike):
-        raise TerrainLoopError(
-            expected="the path of a cloud", found=f"{path!r:.60}", mend="give a path; Submap takes points"
-        )
-    return Path(path)
 
 
 def _reader_for(path: Path) -> Callable[[Path], Table]:
