@@ -311,6 +311,29 @@ def query_time(folders, _):
         print(f"  {name}: {1e3 * seconds / len(stored):.2f} ms per pair")
 
 
+def driven(kind, terrain, for_path, drive, streams):
+    """Submaps that a sensor makes on a drive: their clouds and true poses."""
+    setup, (for_odometry, for_sensor) = SETUPS[kind], streams
+    path = revisiting_path(np.random.default_rng(for_path), drive, setup.frame_spacing)
+    true = true_poses(terrain, path)
+    frames = estimate(true, setup.frames, setup.drift, np.random.default_rng(for_odometry))
+    count = len(true) // setup.frames
+    clouds = []
+    with ThreadPoolExecutor() as pool:
+        for i, stream in enumerate(for_sensor.spawn(count)):
+            chosen = slice(i * setup.frames, (i + 1) * setup.frames)
+            clouds.append(submap_cloud(setup, terrain, true[chosen], frames.local[chosen], stream, pool))
+    return clouds, list(frames.truth[:count])
+
+
+def seen_by_the_other(records, poses):
+    """Share of the bounding box of each submap (rows) that lies in that of each other."""
+    boxes = world_boxes([record.hull for record in records], poses)
+    low = np.maximum(boxes[:, None, :2], boxes[:, :2])
+    shared = np.clip(np.minimum(boxes[:, None, 2:], boxes[:, 2:]) - low, 0, None).prod(axis=-1)
+    return shared / (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)[:, None]
+
+
 def sensors(_, __):
     """Stereo submaps against LiDAR submaps of one simulated world, driven along one path."""
     seed, drive = SeedSequence(7), 112.0
@@ -322,37 +345,19 @@ def sensors(_, __):
         path = revisiting_path(np.random.default_rng(for_path), drive, lidar.frame_spacing)
         half = np.abs(path.xy).max() + lidar.sensor.max_range + 2.0
         terrain = make_terrain(world, for_terrain, 2 * float(half), SETUPS["stereo"].terrain_resolution)
-        clouds, poses, kinds = [], [], []
-        for kind, (for_odometry, for_sensor) in zip(
-            ("lidar", "stereo"), (streams[:2], streams[2:]), strict=True
-        ):
-            setup = SETUPS[kind]
-            path = revisiting_path(np.random.default_rng(for_path), drive, setup.frame_spacing)
-            true = true_poses(terrain, path)
-            frames = estimate(true, setup.frames, setup.drift, np.random.default_rng(for_odometry))
-            count = len(true) // setup.frames
-            with ThreadPoolExecutor() as pool:
-                for i, stream in enumerate(for_sensor.spawn(count)):
-                    chosen = slice(i * setup.frames, (i + 1) * setup.frames)
-                    clouds.append(
-                        submap_cloud(setup, terrain, true[chosen], frames.local[chosen], stream, pool)
-                    )
-                    kinds.append(kind)
-            poses += list(frames.truth[:count])
-        submaps = [Submap(points, f"{i:03d}", stamp=float(i)) for i, points in enumerate(clouds)]
-        stereo = [s for s, kind in zip(submaps, kinds, strict=True) if kind == "stereo"]
-        parameters = fit_database(stereo[:3], EVIDENCE, workers=2)
-        ready = [map_submap(s, EVIDENCE, parameters, workers=2) for s in submaps]
-        first = kinds.index("stereo")
-        candidates = [
-            compare(b, a, EVIDENCE, pairs=len(stereo) * first) for b in ready[first:] for a in ready[:first]
+        targets, target_poses = driven("lidar", terrain, for_path, drive, streams[:2])
+        sources, source_poses = driven("stereo", terrain, for_path, drive, streams[2:])
+        submaps = [
+            Submap(points, f"{i:03d}", stamp=float(i)) for i, points in enumerate([*targets, *sources])
         ]
-        records = [SubmapRecord.of(s) for s in submaps]
-        boxes = world_boxes([record.hull for record in records], np.array(poses))
-        low = np.maximum(boxes[:, None, :2], boxes[:, :2])
-        shared = np.clip(np.minimum(boxes[:, None, 2:], boxes[:, 2:]) - low, 0, None).prod(axis=-1)
-        seen = shared / (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)[:, None]
-        pairs = evaluate_pairs(candidates, GroundTruth(records, np.array(poses)))
+        first = len(targets)
+        parameters = fit_database(submaps[first : first + 3], EVIDENCE, workers=2)
+        ready = [map_submap(s, EVIDENCE, parameters, workers=2) for s in submaps]
+        compared = len(sources) * first
+        candidates = [compare(b, a, EVIDENCE, pairs=compared) for b in ready[first:] for a in ready[:first]]
+        records, poses = [SubmapRecord.of(s) for s in submaps], np.array(target_poses + source_poses)
+        seen = seen_by_the_other(records, poses)
+        pairs = evaluate_pairs(candidates, GroundTruth(records, poses))
         halves = [p for p in pairs if seen[int(p.candidate.source), int(p.candidate.target)] > 0.5]
         found = [p for p in halves if p.candidate and p.pose_is_right]
         wrong = sum(bool(p.candidate) and not p.pose_is_right for p in pairs)

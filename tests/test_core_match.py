@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import PARAMETERS, World, map_of
+from conftest import PARAMETERS, World, map_of, ridges
 
 from terrainloop import _core
 from terrainloop.config import Calibration, MatchSettings, Settings
@@ -117,19 +117,6 @@ def test_loops_are_those_of_python(pair):
     candidate, match = same_decision(*pair)
     assert candidate
     same_pose(candidate, match)
-
-
-def ridges(seed):
-    """Crests along y of many sizes."""
-    rng = np.random.default_rng(seed)
-    centres, sizes, heights = rng.uniform(-9, 9, 60), rng.uniform(0.2, 0.5, 60), rng.normal(0, 0.12, 60)
-
-    def ground(xy):
-        offset = xy[:, :1] - centres
-        bumps = heights * np.exp(-0.5 * (offset / sizes) ** 2)
-        return bumps.sum(1), np.c_[-(offset / sizes**2 * bumps).sum(1), 0 * xy[:, 0]]
-
-    return ground
 
 
 def ripples(xy):

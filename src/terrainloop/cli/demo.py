@@ -1,8 +1,9 @@
 """``terrainloop demo``: simulate a mission, detect its loops, compare them with the ground truth."""
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -26,8 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from terrainloop.detection.run import Run
+    from terrainloop.geometry import Array
     from terrainloop.io.missions import Mission
-    from terrainloop.loop import LoopCandidate
 
 
 HELP = "Simulate a rover mission, find its loop closures, compare them with the truth, draw figures."
@@ -51,10 +52,8 @@ def command(
     """Run ``terrainloop demo``."""
     from terrainloop.config import Settings
     from terrainloop.detection.mission import detect_mission
-    from terrainloop.evaluation.pairs import evaluate_pairs
-    from terrainloop.evaluation.truth import MIN_OVERLAP, GroundTruth
     from terrainloop.io.missions import load_mission
-    from terrainloop.report import INSTALL_FIGURES, can_draw
+    from terrainloop.report import can_draw
     from terrainloop.simulation.missions import simulate_mission, write_mission, written_before
 
     terminal = Terminal.open(as_json, quiet, verbose)
@@ -64,49 +63,56 @@ def command(
     written_before(folder)  # refuse before the work is done
     number = worker_count(workers)
     with terminal.progress() as progress:
-        simulated = simulate_mission(
-            world, seed, submaps, progress=lambda done, total: progress("simulated", done, total)
-        )
+        simulated = simulate_mission(world, seed, submaps, progress=partial(progress, "simulated"))
     write_mission(simulated, folder)
     mission = load_mission(folder)
     with terminal.progress() as progress:
         run = detect_mission(mission, settings, output=output, workers=number, on_progress=progress)
-    candidates = list(run.pairs())
-    pairs = evaluate_pairs(candidates, GroundTruth(run.submaps, simulated.truth))
     pictures: list[str] = []
-    summary = detect.summarise(run) | {
-        "false_loops": sum(not pair.pose_is_right for pair in pairs if pair.candidate),
-        "true_pairs": sum(pair.overlap > MIN_OVERLAP for pair in pairs),
-        "true_pairs_found": sum(pair.overlap > MIN_OVERLAP for pair in pairs if pair.candidate),
-        "pictures": pictures,
-    }
-
-    def show(console: Console) -> None:
-        detect.show(console, run)
-        console.print(
-            f"Against the ground truth: {summary['true_pairs_found']} of {summary['true_pairs']} pairs that "
-            f"share over {MIN_OVERLAP:.0%} of their ground found, {summary['false_loops']} false loops."
-        )
-        without = "none" if can_draw() else f"none; matplotlib is missing: {INSTALL_FIGURES}"
-        console.print("Pictures: " + (printable(", ".join(pictures)) or without))
-
+    summary = detect.summarise(run) | _against_truth(run, simulated.truth) | {"pictures": pictures}
     try:
         if run.complete and can_draw():
             from terrainloop.report.figures import save_figure
 
-            best = max(candidates, key=lambda candidate: candidate.score)
-            for picture, figure in _figures(mission, run, best):
+            for picture, figure in _figures(mission, run):
                 save_figure(figure, output / picture)
                 pictures.append(str(output / picture))
     finally:  # the results are there even if the pictures fail
-        terminal.result(summary, show)
+        terminal.result(summary, partial(_show, run, summary))
 
 
-def _figures(mission: "Mission", run: "Run", best: "LoopCandidate") -> Iterator[tuple[str, "Figure"]]:
+def _against_truth(run: "Run", truth: "Array") -> dict[str, int]:
+    """False loops, true pairs and those of them found, for JSON."""
+    from terrainloop.evaluation.pairs import evaluate_pairs
+    from terrainloop.evaluation.truth import MIN_OVERLAP, GroundTruth
+
+    pairs = evaluate_pairs(list(run.pairs()), GroundTruth(run.submaps, truth))
+    return {
+        "false_loops": sum(not pair.pose_is_right for pair in pairs if pair.candidate),
+        "true_pairs": sum(pair.overlap > MIN_OVERLAP for pair in pairs),
+        "true_pairs_found": sum(pair.overlap > MIN_OVERLAP for pair in pairs if pair.candidate),
+    }
+
+
+def _show(run: "Run", summary: dict[str, Any], console: Console) -> None:
+    from terrainloop.evaluation.truth import MIN_OVERLAP
+    from terrainloop.report import INSTALL_FIGURES, can_draw
+
+    detect.show(console, run)
+    console.print(
+        f"Against the ground truth: {summary['true_pairs_found']} of {summary['true_pairs']} pairs that "
+        f"share over {MIN_OVERLAP:.0%} of their ground found, {summary['false_loops']} false loops."
+    )
+    without = "none" if can_draw() else f"none; matplotlib is missing: {INSTALL_FIGURES}"
+    console.print("Pictures: " + (printable(", ".join(summary["pictures"])) or without))
+
+
+def _figures(mission: "Mission", run: "Run") -> Iterator[tuple[str, "Figure"]]:
     """The mission with its loop closures, one gradient map, and the match with the highest score."""
     from terrainloop.report.figures import figure_map, figure_match, figure_mission
 
     assert mission.truth is not None
+    best = max(run.pairs(), key=lambda candidate: candidate.score)
     source, target = run.entries[best.source], run.entries[best.target]
     hulls = [record.hull for record in run.submaps]
     title = f"{len(run.loops)} loop closures, submaps at their true poses"
