@@ -167,12 +167,6 @@ def test_every_reason_is_given_where_it_should_be(scene):
     assert is_for(loop, REASONS[scene]), loop.reason
 
 
-def test_keypoints_propose_where_the_search_does_not():
-    loop = register(*scene_maps("a loop"), calibrated(dense_hypotheses=0))
-    assert loop
-    assert loop.found_by == "sparse"
-
-
 # --- mutations
 
 QUICKER = {
@@ -232,7 +226,6 @@ SCENE_MUTANTS = [
     ("same ground twice", "ambiguity_ratio", 0.99),
     ("like ground beside", "ambiguity_ratio", 0.1),
     ("few ridges", "ambiguity_chance", 1e-9),
-    ("same ground twice", "dense_hypotheses", 1),
     ("same ground twice", "min_separation", 20.0),
     ("small", "max_correlation", 0.99999),
     ("small, enough", "max_correlation", 0.9),
@@ -246,16 +239,7 @@ def test_a_constant_that_moves_changes_a_reason(scene, constant, value):
     assert not is_for(loop, REASONS[scene]), loop.reason
 
 
-OF_KEYPOINTS = ("sparse_hypotheses", "ransac_hypotheses")
-
-
-@pytest.mark.parametrize("constant", OF_KEYPOINTS)
-def test_without_keypoints_nothing_is_proposed_where_the_search_does_not(constant):
-    loop = register(*scene_maps("a loop"), calibrated(dense_hypotheses=0, **{constant: 0}))
-    assert not loop
-
-
 def test_every_constant_is_moved():
-    moved = {constant for _, constant, _ in MUTANTS + SCENE_MUTANTS} | set(OF_KEYPOINTS)
+    moved = {constant for _, constant, _ in MUTANTS + SCENE_MUTANTS}
     moved |= {constant for constant, _ in NULL_MUTANTS}
     assert moved == set(Calibration.model_fields)

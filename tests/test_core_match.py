@@ -17,7 +17,6 @@ from terrainloop.gradient_map import GradientMap
 from terrainloop.matching.register import compare
 from terrainloop.record import SubmapRecord
 
-WITHOUT_KEYPOINTS = {"sparse_hypotheses": 0, "ransac_hypotheses": 0}
 NO_KEYPOINTS = Features(np.empty((0, 2)), *np.empty((3, 0)), np.empty((0, 128), np.float32), "sift")
 UTM = np.array([5e5, 4e6])
 BIG = {"origin": (-4.0, -4.0), "shape": (100, 100)}
@@ -30,7 +29,7 @@ def entry(name, gradient_map, calibration):
 
 
 def in_python(source, target, *, pairs=1.0, max_false_loops=0.01, **changed):
-    calibration = Calibration(**WITHOUT_KEYPOINTS, **changed)
+    calibration = Calibration(**changed)
     settings = Settings(calibration=calibration, match=MatchSettings(max_false_loops=max_false_loops))
     entries = entry("b", source, calibration), entry("a", target, calibration)
     return compare(*entries, settings, pairs=pairs)
@@ -198,9 +197,7 @@ def test_settings_have_the_effect_they_have_in_python(word, changed):
 
 def test_the_calibration_is_that_of_python():
     python = Calibration().model_dump(mode="json")
-    assert _core.calibration() == {
-        k: v for k, v in python.items() if k not in WITHOUT_KEYPOINTS and not k.startswith("null_")
-    }
+    assert _core.calibration() == {k: v for k, v in python.items() if not k.startswith("null_")}
 
 
 def test_impossible_settings_are_refused():

@@ -16,7 +16,6 @@ from terrainloop.matching import hypotheses, significance
 from terrainloop.matching.covariance import block_covariance
 from terrainloop.matching.refine import refine
 from terrainloop.matching.register import compare, register
-from terrainloop.matching.significance import combined_surprisal, surprisal_of_inliers
 from terrainloop.record import SubmapRecord
 
 CALIBRATION = Calibration()
@@ -73,33 +72,6 @@ def test_surprisal_at_the_ends():
     assert np.isfinite(surprisal(1.0, 100.0))
     assert surprisal(1.0, 100.0) > surprisal(0.9, 100.0)
     assert surprisal(1.0, 100.0) == surprisal(0.9999, 100.0)  # no map is trusted to agree that well
-
-
-def test_surprisal_of_inliers_is_the_binomial_tail():
-    for inliers, associations, chance in ((1, 40, 0.01), (3, 130, 0.002), (20, 150, 0.003), (40, 40, 0.5)):
-        exact = -binom.logsf(inliers - 1, associations, chance)
-        assert surprisal_of_inliers(inliers, associations, chance) == pytest.approx(exact, rel=1e-6)
-    assert surprisal_of_inliers(0, 50, 0.01) == surprisal_of_inliers(-2, 50, 0.01) == 0
-    assert surprisal_of_inliers(3, 3, 1.0) == pytest.approx(0)
-    assert np.isfinite(surprisal_of_inliers(400, 400, 1e-4))
-
-
-def test_two_surprisals_are_as_rare_together_as_they_say():
-    """Independent ones of unit decay: chance exceeds a level no more often than exp(-level), nor far less."""
-    rng = np.random.default_rng(0)
-    field, inliers = rng.exponential(size=(2, 200_000))
-    both = np.array([combined_surprisal(f, i) for f, i in zip(field, inliers, strict=True)])
-    for level in (1.0, 3.0, 5.0):
-        assert 0.4 * np.exp(-level) < (both >= level).mean() < 1.05 * np.exp(-level)
-
-
-def test_inliers_can_only_help():
-    """But for the factor of two that it costs to look at them."""
-    assert combined_surprisal(30.0, 0.0) == pytest.approx(30.0 - np.log(2))
-    assert combined_surprisal(30.0, 30.0) > 54.0
-    assert combined_surprisal(0.0, 0.0) == 0.0
-    values = [combined_surprisal(12.0, inliers) for inliers in np.linspace(0, 50, 60)]
-    assert (np.diff(values) >= 0).all()
 
 
 def test_the_number_of_poses_goes_with_what_was_tried():
@@ -250,7 +222,7 @@ def test_maps_that_overlap_are_a_loop(world, T, options):
     assert abs(yaw_of(inverse(T) @ se2(0, 0, yaw_of(loop.T_target_source)))) < 0.005
     assert loop.correlation > 0.8
     assert loop.score > 5
-    assert loop.found_by in ("dense", "sparse")
+    assert loop.found_by == "dense"
     assert f"correlation {loop.correlation:.2f}" in loop.reason
 
 
@@ -263,25 +235,16 @@ def test_either_may_be_the_source(world):
     assert there.overlap == pytest.approx(back.overlap, abs=0.02)
 
 
-def test_what_proposed_the_pose_is_told(world):
-    """No keypoint, no sparse hypothesis; where the field was searched in vain, the keypoints'."""
+def test_keypoints_describe_a_loop_and_do_not_decide(world):
     source, target = (mapped(n, m) for n, m in (("b", world(0).map(se2(0.4, 0, 1))), ("a", world(0).map())))
     nothing = replace(source.features, positions=source.features.positions[:0])
-    loop = compare(replace(source, features=nothing), target, STRICT)
-    assert loop
-    assert loop.found_by == "dense"
-    assert loop.inliers == 0
-
-
-def test_keypoints_find_what_the_search_misses(world, monkeypatch):
-    whole = hypotheses.search
-    monkeypatch.setattr(hypotheses, "search", lambda *args: replace(whole(*args), poses=[]))
-    T = se2(0.4, -0.3, 0.7)
-    loop = judge(world(0).map(T, **BIG), world(0).map(**BIG))
-    assert loop
-    assert loop.found_by == "sparse"
+    loop, without = (compare(s, target, STRICT) for s in (source, replace(source, features=nothing)))
     assert loop.inliers > 5
-    assert np.hypot(*(loop.T_target_source[:2, 3] - T[:2, 2])) < 0.02
+    assert without.inliers == 0
+    assert without.score == loop.score
+    np.testing.assert_array_equal(without.T_target_source, loop.T_target_source)
+    unrelated = compare(mapped("c", world(3).map()), target, STRICT)
+    assert unrelated.inliers == 0  # counted for loops only
 
 
 def test_unrelated_ground_is_explained_by_chance(world):

@@ -145,3 +145,24 @@ def test_what_is_built_has_level_tops_and_straight_parallel_edges():
     steep = np.hypot(slope_x, slope_y) > 0.5
     heading = np.arctan2(slope_y, slope_x)[steep]
     assert np.abs(np.exp(4j * heading).mean()) > 0.6  # at right angles to one another
+
+
+def test_a_symmetric_figure_is_mapped_onto_itself_by_a_turn_about_its_middle():
+    orders = set()
+    for seed in range(60):
+        heights = relief.symmetric_figure(_rng(seed), GRID, height=0.15)
+        assert 0.14 < heights.max() < 0.16
+        middle = 250 + _rng(seed).uniform([0, -1, -1], [np.pi, 1, 1])[1:] / GRID.resolution  # as it is drawn
+        orders.add(_order_of_symmetry(heights, middle[::-1]))
+    assert orders == {2, 3, 4, 5, 6, np.inf}
+
+
+def _order_of_symmetry(heights, middle):
+    """How often a turn about a (row, column) maps a figure onto itself; infinite for rings."""
+    angle, radius = np.meshgrid(np.arange(720) * np.pi / 360, np.linspace(0.2, 3.5, 60) / GRID.resolution)
+    rows, columns = middle[0] + radius * np.sin(angle), middle[1] + radius * np.cos(angle)
+    polar = ndimage.map_coordinates(heights, [rows, columns], order=1)
+    harmonics = np.abs(np.fft.rfft(polar, axis=1)[:, 1:40]).sum(axis=0)
+    if harmonics.max() < 0.05 * np.abs(polar).sum():
+        return np.inf
+    return 1 + int(np.flatnonzero(harmonics > 0.2 * harmonics.max())[0])

@@ -36,6 +36,7 @@ void visit_numbers(Calibration& c, const Visit& visit) {
   visit("max_correlation", c.max_correlation);
   visit("min_correlation", c.min_correlation);
   visit("ambiguity_ratio", c.ambiguity_ratio);
+  visit("equivalence_ratio", c.equivalence_ratio);
   visit("ambiguity_chance", c.ambiguity_chance);
   visit("block", c.block);
   visit("usual_strain", c.usual_strain);

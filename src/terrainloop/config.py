@@ -153,9 +153,9 @@ class Calibration(_Frozen):
         0.8, gt=0, le=1, description="search: size of the FFT, share of that without wrap-around"
     )
     candidates: int = Field(11, ge=1, description="search: places whose surprisal is kept for the null")
-    dense_hypotheses: int = Field(2, ge=0, description="hypotheses of the search that are refined")
-    sparse_hypotheses: int = Field(1, ge=0, description="hypotheses of the keypoints that are refined")
-    ransac_hypotheses: int = Field(6, ge=0, description="largest inlier sets that are weighed")
+    dense_hypotheses: int = Field(
+        2, ge=0, description="places refined to see if a pair is significant; if it is, all are"
+    )
     # Significance (section 3)
     tail: float = Field(0.85, gt=0, description="calibrated nats per nat of the correlation's formula")
     independent_tests: float = Field(
@@ -170,6 +170,9 @@ class Calibration(_Frozen):
         0.25, ge=0, lt=1, description="smallest correlation of the fields of a loop closure"
     )
     ambiguity_ratio: float = Field(0.5, gt=0, description="surprisal of a rival pose, share of the best's")
+    equivalence_ratio: float = Field(
+        0.7, gt=0, description="the same, above which a rival counts however likely it is by chance"
+    )
     ambiguity_chance: float = Field(0.01, gt=0, description="NFA above which a rival is left to chance")
     # Covariance (section 4)
     block: float = Field(2.0, gt=0, description="side of the independent blocks of ground, length scales")

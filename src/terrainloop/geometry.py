@@ -23,6 +23,13 @@ def se2(x: float, y: float, yaw: float) -> Array:
     return np.array([[c, -s, x], [s, c, y], [0.0, 0.0, 1.0]])
 
 
+def rotation_about(centre: ArrayLike, yaw: float) -> Array:
+    """SE(2) transform (3, 3): a rotation in radians about a point (2,) in metres."""
+    T = se2(0.0, 0.0, yaw)
+    T[:2, 2] = centre - T[:2, :2] @ np.asarray(centre)
+    return T
+
+
 def yaw_of(T: Array) -> float:
     """Rotation about z, in radians within (-pi, pi], of an SE(2) or SE(3) transform."""
     return float(np.arctan2(T[1, 0], T[0, 0]))

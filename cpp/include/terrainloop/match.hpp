@@ -26,7 +26,7 @@ struct Calibration {
   double peak_threshold = 6.0;    ///< r^2 of a candidate, in units of its mean
   double wraparound = 0.8;        ///< FFT size, share of that without wrap-around
   int candidates = 11;            ///< places whose surprisal is kept for the null
-  int dense_hypotheses = 2;       ///< of the search, refined
+  int dense_hypotheses = 2;       ///< places refined to see if a pair is significant; if it is, all are
   // Significance
   double tail = 0.85;               ///< calibrated nats per nat of the correlation's formula
   double independent_tests = 0.05;  ///< per rotation step and squared length scale of shift
@@ -34,6 +34,7 @@ struct Calibration {
   // Decision
   double min_correlation = 0.25;   ///< of the fields of a loop closure
   double ambiguity_ratio = 0.5;    ///< surprisal of a rival pose, share of the best's
+  double equivalence_ratio = 0.7;  ///< the same, above which a rival counts however likely it is by chance
   double ambiguity_chance = 0.01;  ///< NFA above which a rival is left to chance
   // Covariance
   double block = 2.0;                 ///< side of the independent blocks of ground, length scales

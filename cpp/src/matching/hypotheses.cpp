@@ -47,11 +47,10 @@ Hypothesis Pair::refined(const Hypothesis& hypothesis) const {
   return better.surprisal > hypothesis.surprisal ? better : hypothesis;
 }
 
-std::vector<Hypothesis> Pair::propose() const {
+std::vector<Hypothesis> Pair::propose(std::size_t first, std::size_t last) const {
   std::vector<Hypothesis> hypotheses;
-  const std::size_t count =
-      std::min(found.poses.size(), static_cast<std::size_t>(calibration.dense_hypotheses));
-  for (std::size_t i = 0; i < count; ++i) hypotheses.push_back(refined(weigh(found.poses[i])));
+  for (std::size_t i = first; i < std::min(last, found.poses.size()); ++i)
+    hypotheses.push_back(refined(weigh(found.poses[i])));
   return hypotheses;
 }
 

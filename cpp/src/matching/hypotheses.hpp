@@ -24,8 +24,9 @@ struct Pair {
   /// The evidence for a pose; none where the overlap is too small or the fields disagree.
   Hypothesis weigh(const Matrix3d& T) const;
 
-  /// The best places of the search, each at the pose near it where the gradients agree best.
-  std::vector<Hypothesis> propose() const;
+  /// Places of the search from the first to before the last, each at the pose near it where the gradients
+  /// agree best.
+  std::vector<Hypothesis> propose(std::size_t first, std::size_t last) const;
 
   const GradientMapView &source, &target;
   const Calibration& calibration;

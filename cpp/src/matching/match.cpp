@@ -23,6 +23,8 @@ using namespace matching;
 
 constexpr int kRejectedStep = 3;       // every third row and column is enough to show a rejected pair
 constexpr double kNoEvidence = -10.0;  // score of a pair for which no hypothesis could be weighed
+constexpr int kTurns = 6;  // of 1/7: none maps ground that is the same after 1/2 ... 1/6 onto itself
+constexpr double kPi = 3.141592653589793;
 constexpr double kLn10 = 2.302585092994046;
 constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
 
@@ -34,6 +36,13 @@ struct Weighed {
   double needed;  ///< surprisal at which the expected number of false loops is what is allowed, nats
 
   double log_nfa() const { return (log_tests - best.surprisal) / kLn10; }
+  /// Surprisal above which another pose explains the pair as well: a large share of the best's, and either
+  /// unlikely by chance or nearly all of it.
+  double rivalling(const Calibration& calibration) const {
+    const double by_chance = log_tests - std::log(calibration.ambiguity_chance);
+    return std::max(calibration.ambiguity_ratio * best.surprisal,
+                    std::min(by_chance, calibration.equivalence_ratio * best.surprisal));
+  }
   bool significant() const { return best.surprisal >= needed; }
 };
 
@@ -58,6 +67,40 @@ std::string number(double value, int digits) {
   return text.str();
 }
 
+/// A number with so many decimals.
+std::string fixed(double value, int decimals) {
+  std::ostringstream text;
+  text.imbue(std::locale::classic());
+  text << std::fixed;
+  text.precision(decimals);
+  text << value;
+  return text.str();
+}
+
+/// Which poses explain a pair as well as T does, in words.
+std::string ambiguity(const Pair& pair, const Matrix3d& T, const std::vector<Hypothesis>& rivals,
+                      double rivalling) {
+  Matrix3d motion = Matrix3d::Identity();
+  const Hypothesis* strongest = &rivals.front();
+  for (const Hypothesis& rival : rivals) {
+    const Matrix3d from_best = rival.T_target_source * inverse(T);
+    if (std::abs(yaw_of(from_best)) > std::abs(yaw_of(motion))) motion = from_best;
+    if (rival.surprisal > strongest->surprisal) strongest = &rival;
+  }
+  const Eigen::Matrix2d turn = Eigen::Matrix2d::Identity() - motion.topLeftCorner<2, 2>();
+  const Vector2d centre = turn.completeOrthogonalDecomposition().solve(motion.topRightCorner<2, 1>());
+  std::vector<double> turned;
+  for (int k = 1; k <= kTurns; ++k)
+    turned.push_back(pair.weigh(rotation_about(centre, 2.0 * kPi * k / (kTurns + 1)) * T).surprisal);
+  std::sort(turned.begin(), turned.end());
+  if (0.5 * (turned[kTurns / 2 - 1] + turned[kTurns / 2]) > rivalling)
+    return "undetermined in yaw, the ground is round about x " + fixed(centre.x(), 2) + " m, y " +
+           fixed(centre.y(), 2) + " m";
+  const Matrix3d& rival = strongest->T_target_source;
+  return "ambiguous, the pose x " + fixed(rival(0, 2), 2) + " m, y " + fixed(rival(1, 2), 2) + " m, yaw " +
+         fixed(yaw_of(rival) * 180.0 / kPi, 0) + " deg fits as well";
+}
+
 /// Why the best hypothesis is no loop closure, in words; empty if it is one.
 std::string objection_to(const Pair& pair, const Weighed& weighed,
                          const std::optional<Refinement>& refinement) {
@@ -67,11 +110,11 @@ std::string objection_to(const Pair& pair, const Weighed& weighed,
   if (!weighed.significant()) return "chance explains it";
   if (weighed.rivals.empty())
     return "weak agreement, correlation below " + number(calibration.min_correlation, 6);
-  const double rivalling = std::max(calibration.ambiguity_ratio * best.surprisal,
-                                    weighed.log_tests - std::log(calibration.ambiguity_chance));
+  const double rivalling = weighed.rivalling(calibration);
+  std::vector<Hypothesis> equal;
   for (const Hypothesis& rival : weighed.rivals)
-    if (rival.surprisal > rivalling && !pair.same_place(rival.T_target_source, T))
-      return "ambiguous, another place fits as well";
+    if (rival.surprisal > rivalling && !pair.same_place(rival.T_target_source, T)) equal.push_back(rival);
+  if (!equal.empty()) return ambiguity(pair, T, equal, rivalling);
   if (!refinement || !pair.same_place(refinement->T_target_source(), T))
     return "undetermined, the refinement converges elsewhere";
   if (refinement->covariance().hasNaN()) return "undetermined, too little ground to determine the pose";
@@ -90,13 +133,8 @@ std::string power_of_ten(double exponent) {
 std::string reason(const Weighed& weighed, const std::string& objection, double allowed) {
   const double exponent = (weighed.needed - weighed.best.surprisal) / kLn10 + std::log10(allowed);
   const Agreement& agreement = weighed.best.agreement;
-  std::ostringstream correlation;
-  correlation.imbue(std::locale::classic());
-  correlation << std::fixed;
-  correlation.precision(2);
-  correlation << agreement.correlation;
   return (objection.empty() ? "" : objection + ": ") + power_of_ten(exponent) + " false loops expected, " +
-         number(allowed, 6) + " allowed; correlation " + correlation.str() + " over " +
+         number(allowed, 6) + " allowed; correlation " + fixed(agreement.correlation, 2) + " over " +
          number(agreement.area, 3) + " m^2";
 }
 
@@ -154,13 +192,18 @@ Match match(const GradientMapView& source, const GradientMapView& target, const 
     return without_transform("too little ground: an overlap of " + number(area, 3) +
                              " m^2 at a length scale of " + number(pair.length_scale(), 2) + " m is needed");
   }
-  const std::vector<Hypothesis> hypotheses = pair.propose();
+  const auto first = static_cast<std::size_t>(calibration.dense_hypotheses);
+  std::vector<Hypothesis> hypotheses = pair.propose(0, first);
   if (hypotheses.empty())
     return without_transform("featureless: the ground has no structure that could agree");
-  const Weighed weighed = weigh(pair, hypotheses, settings);
+  Weighed weighed = weigh(pair, hypotheses, settings);
   std::optional<Refinement> refinement;
-  if (weighed.significant())
+  if (weighed.significant()) {  // any other place may be a rival
+    const std::vector<Hypothesis> others = pair.propose(first, pair.found.poses.size());
+    hypotheses.insert(hypotheses.end(), others.begin(), others.end());
+    weighed = weigh(pair, hypotheses, settings);
     refinement = Refinement::of(source, target, weighed.best.T_target_source, calibration, kThorough);
+  }
   const std::string objection = objection_to(pair, weighed, refinement);
   if (!objection.empty()) refinement.reset();
   Match found = decided(pair, weighed, refinement);

@@ -98,9 +98,7 @@ std::array<Matrix3d, 2> Refinement::weakest(double distance) const {
 
 /// The pose after a rotation about the pivot and a shift, in the target frame.
 Matrix3d Refinement::moved(double dx, double dy, double yaw) const {
-  Matrix3d move = se2(0.0, 0.0, yaw);
-  move.topRightCorner<2, 1>() = pivot() - transform(move, pivot()) + Vector2d(dx, dy);
-  return move * T_target_source();
+  return se2(dx, dy, 0.0) * rotation_about(pivot(), yaw) * T_target_source();
 }
 
 }  // namespace terrainloop::matching

@@ -30,6 +30,13 @@ inline Matrix3d inverse(const Matrix3d& T) {
   return result;
 }
 
+/// A rotation about a point.
+inline Matrix3d rotation_about(const Vector2d& centre, double yaw) {
+  Matrix3d T = se2(0.0, 0.0, yaw);
+  T.topRightCorner<2, 1>() = centre - T.topLeftCorner<2, 2>() * centre;
+  return T;
+}
+
 /// From (column, row) to metres on the grid of a map or field.
 inline Matrix3d metres_from_pixels(double x, double y, double spacing) {
   return (Matrix3d() << spacing, 0, x, 0, spacing, y, 0, 0, 1).finished();

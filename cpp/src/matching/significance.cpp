@@ -12,8 +12,7 @@ double surprisal_of_correlation(double correlation_squared, double samples, cons
 
 double surprisal_of_field(double correlation, double samples, const Calibration& calibration) {
   const double squared = std::pow(std::max(correlation, 0.0), 2);
-  const double surprisal = calibration.tail * surprisal_of_correlation(squared, samples, calibration);
-  return std::max(surprisal - std::log(2.0), 0.0);
+  return calibration.tail * surprisal_of_correlation(squared, samples, calibration);
 }
 
 double log_num_tests(double tried, const std::vector<double>& surprisals, const Calibration& calibration) {

@@ -13,8 +13,7 @@ namespace terrainloop::matching {
 /// as (1 - r^2)^((n - 1) / 2).
 double surprisal_of_correlation(double correlation_squared, double samples, const Calibration& calibration);
 
-/// Of the agreement of two fields: that of the correlation, with the calibrated tail, less the factor of two
-/// that choosing the better of two tests costs (docs/matching.md, section 3).
+/// Of the agreement of two fields: that of the correlation, with the calibrated tail.
 double surprisal_of_field(double correlation, double samples, const Calibration& calibration);
 
 /// Natural logarithm of the number of independent tests among the poses that a search tried, from their

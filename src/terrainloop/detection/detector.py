@@ -9,6 +9,7 @@ from threading import Lock
 import numpy as np
 
 from terrainloop.config import Settings
+from terrainloop.detection.allowance import pairs_equivalent, plausible_by_odometry, share_of_query
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import Array
@@ -45,7 +46,7 @@ class LoopDetector:
         Hyperparameters of the Gaussian process, if known; otherwise fitted according to ``settings.map.fit``.
     expected_pairs : int, optional
         Number of pairs that the mission will compare, if known: `max_false_loops` is shared among them.
-        Otherwise each query is given less of it than the one before, so that it holds for any number.
+        Otherwise later queries are given less of it, so that it holds for any number (see `allowance`).
     null_scores : sequence of float, optional
         Scores of mirror images, where they are known (see `sample_null`); else measured on the way.
     on_pair : callable, optional
@@ -103,7 +104,7 @@ class LoopDetector:
     def __repr__(self) -> str:
         return f"LoopDetector({len(self.entries)} submaps, {len(self.loops)} loops)"
 
-    def add(self, submap: Submap) -> list[LoopCandidate]:
+    def add(self, submap: Submap, odometry: Array | None = None) -> list[LoopCandidate]:
         """Map a submap, compare it with the earlier ones, store it.
 
         Safe to call from several threads: submaps are added one after the other.
@@ -112,6 +113,8 @@ class LoopDetector:
         ----------
         submap : Submap
             A submap with a name that is not taken; one without a name is named by its number.
+        odometry : array, (4, 4), optional
+            T_world_submap by odometry: more of `max_false_loops` is spent on pairs that it makes plausible.
 
         Returns
         -------
@@ -124,8 +127,11 @@ class LoopDetector:
             If the name is taken or no map can be made; the detector is then as it was.
         """
         _require(isinstance(submap, Submap), "a Submap", submap)
+        _require(odometry is None or _is_pose(odometry), "a finite (4, 4) odometry or None", odometry)
         with self._adding:
-            query = map_submap(submap, self.settings, self.parameters, workers=self.workers)
+            query = map_submap(
+                submap, self.settings, self.parameters, odometry=odometry, workers=self.workers
+            )
             if submap.name == UNNAMED:
                 name = f"{UNNAMED}_{len(self.entries):06d}"
                 query = replace(query, record=replace(query.record, name=name))
@@ -148,19 +154,29 @@ class LoopDetector:
                 mend="name each submap differently",
             )
         stored = list(self.entries.values())[: max(0, len(self.entries) - self.settings.skip_recent)]
-        # A mission may never end: its k-th query, which finds k stored, may spend 1 / (k (k + 1)) of
-        # `max_false_loops`, all queries together 1.
-        pairs = self.expected_pairs or len(stored) ** 2 * (len(stored) + 1)
+        pairs = self._pairs_equivalent(query, stored)
         candidates = compare_many(query, stored, self.settings, pairs=pairs, workers=self.workers)
         if self.settings.match.decision == "evidence":
             null = self._null_with(query, stored)
-            candidates = [by_mission_null(c, null, self.settings, pairs) for c in candidates]
+            candidates = [
+                by_mission_null(candidate, null, self.settings, among)
+                for candidate, among in zip(candidates, pairs, strict=True)
+            ]
         self.entries[query.id] = query
         for candidate in candidates:
             self._on_pair(candidate)
         loops = [candidate for candidate in candidates if candidate]
         self.loops += loops
         return loops
+
+    def _pairs_equivalent(self, query: MapEntry, stored: Sequence[MapEntry]) -> Array:
+        """Among how many pairs `max_false_loops` is shared, as seen by each pair of a query."""
+        if not stored:
+            return np.empty(0)
+        known = self.expected_pairs
+        share = len(stored) / known if known else share_of_query(len(stored))
+        since = list(self.entries.values())[len(stored) :]
+        return pairs_equivalent(share, plausible_by_odometry(query, stored, since))
 
     def _null_with(self, query: MapEntry, stored: Sequence[MapEntry]) -> MissionNull:
         """The null of the mission so far; a query adds to it while it is not well known."""
@@ -180,6 +196,10 @@ def _require(met: bool, expected: str, found: object) -> None:
 
 def _is_count(value: object) -> bool:
     return isinstance(value, int | np.integer) and bool(value >= 0)
+
+
+def _is_pose(value: object) -> bool:
+    return isinstance(value, np.ndarray) and value.shape == (4, 4) and bool(np.isfinite(value).all())
 
 
 def _is_finite(value: object) -> bool:

@@ -4,19 +4,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from terrainloop.config import Settings
+from terrainloop.config import Calibration, Settings
 from terrainloop.entry import MapEntry
-from terrainloop.geometry import transform
+from terrainloop.geometry import Array, inverse, rotation_about, transform, yaw_of
 from terrainloop.loop import NO_EVIDENCE, LoopCandidate
+from terrainloop.matching.correspondences import associate
 from terrainloop.matching.hypotheses import Hypothesis, Pair, propose_hypotheses
 from terrainloop.matching.lift import PlanarPrecision, lift_to_se3
 from terrainloop.matching.overlay import Overlay
 from terrainloop.matching.query import Query
+from terrainloop.matching.ransac import get_inliers, inlier_radius_of
 from terrainloop.matching.refine import Refinement, refine
 from terrainloop.matching.significance import log_num_tests
 from terrainloop.matching.ssd import compute_ssd
 
 REJECTED_STEP = 3  # every third row and column is enough to describe a rejected pair
+TURNS = 2 * np.pi * np.arange(1, 7) / 7  # none maps ground onto itself that is the same after 1/2, 1/3 ... 1/6
 UNKNOWN = np.full((3, 3), np.nan)
 LN_10 = float(np.log(10.0))
 
@@ -56,13 +59,22 @@ class Weighed:
         """Decimal logarithm of the number of false alarms of the best hypothesis in one pair."""
         return (self.log_tests - self.best.surprisal) / LN_10
 
+    def rivalling(self, calibration: Calibration) -> float:
+        """Surprisal above which another pose explains the pair as well, nats.
+
+        It must be a large share of the best's, and either unlikely by chance or nearly all of it.
+        """
+        by_chance = self.log_tests - float(np.log(calibration.ambiguity_chance))
+        near = calibration.equivalence_ratio * self.best.surprisal
+        return max(calibration.ambiguity_ratio * self.best.surprisal, min(by_chance, near))
+
     @property
     def significant(self) -> bool:
         """Whether no more than the allowed number of false loops is expected at this surprisal."""
         return self.best.surprisal >= self.needed
 
 
-def compare_by_evidence(query: Query, target: MapEntry, settings: Settings, pairs: float) -> LoopCandidate:
+def compare_by_evidence(query: Query, target: MapEntry, pairs: float, settings: Settings) -> LoopCandidate:
     """Search, propose, refine; take the hypothesis with the highest surprisal, and decide.
 
     Parameters
@@ -70,9 +82,9 @@ def compare_by_evidence(query: Query, target: MapEntry, settings: Settings, pair
     query : Query
         Made for the search grid of the two submaps.
     target : MapEntry
-    settings : Settings
     pairs : float
-        Number of pairs compared in the run; `max_false_loops` is for all of them.
+        Number of pairs that `max_false_loops` is shared among.
+    settings : Settings
     """
     pair = Pair.of(query, target, settings)
     names = query.entry.name, target.name
@@ -80,13 +92,15 @@ def compare_by_evidence(query: Query, target: MapEntry, settings: Settings, pair
         area = settings.calibration.min_shared_area * pair.length_scale**2
         least = f"{area:.3g} m^2 at a length scale of {pair.length_scale:.2g} m"
         return LoopCandidate.without_transform(*names, f"too little ground: an overlap of {least} is needed")
-    hypotheses = propose_hypotheses(pair)
+    first = settings.calibration.dense_hypotheses
+    hypotheses = propose_hypotheses(pair, slice(first))
     if not hypotheses:
         reason = "featureless: the ground has no structure that could agree"
         return LoopCandidate.without_transform(*names, reason)
     weighed = Weighed.of(pair, hypotheses, pairs)
     refinement = None
-    if weighed.significant:
+    if weighed.significant:  # any other place may be a rival
+        weighed = Weighed.of(pair, hypotheses + propose_hypotheses(pair, slice(first, None)), pairs)
         refinement = refine(*pair.maps, weighed.best.T_target_source, settings.calibration)
     objection = _objection(pair, weighed, refinement)
     return _candidate(pair, weighed, None if objection else refinement, objection)
@@ -99,20 +113,32 @@ def _objection(pair: Pair, weighed: Weighed, refinement: Refinement | None) -> s
         return "chance explains it"
     if not weighed.rivals:
         return f"weak agreement, correlation below {calibration.min_correlation:g}"
-    T = best.T_target_source
-    rivalling = max(
-        calibration.ambiguity_ratio * best.surprisal, weighed.log_tests - np.log(calibration.ambiguity_chance)
-    )
-    if any(h.surprisal > rivalling and not pair.same_place(h.T_target_source, T) for h in weighed.rivals):
-        return "ambiguous, another place fits as well"
+    T, rivalling = best.T_target_source, weighed.rivalling(calibration)
+    equal = [
+        h for h in weighed.rivals if h.surprisal > rivalling and not pair.same_place(h.T_target_source, T)
+    ]
+    if equal:
+        return _ambiguity(pair, T, equal, rivalling)
     if refinement is None or not pair.same_place(refinement.T_target_source, T):
         return "undetermined, the refinement converges elsewhere"
     if np.isnan(refinement.covariance).any():
         return "undetermined, too little ground to determine the pose"
     slid = refinement.weakest(calibration.min_separation * pair.source_field.length_scale)
-    if any(pair.weigh(T, best.found_by).surprisal > rivalling for T in slid):
+    if any(pair.weigh(T).surprisal > rivalling for T in slid):
         return "undetermined, the match slides"
     return ""
+
+
+def _ambiguity(pair: Pair, T: Array, rivals: list[Hypothesis], rivalling: float) -> str:
+    """Which poses explain a pair as well as T does, in words."""
+    motion = max((h.T_target_source @ inverse(T) for h in rivals), key=lambda motion: abs(yaw_of(motion)))
+    centre = np.linalg.lstsq(np.eye(2) - motion[:2, :2], motion[:2, 2], rcond=None)[0]
+    turned = [pair.weigh(rotation_about(centre, angle) @ T).surprisal for angle in TURNS]
+    if np.median(turned) > rivalling:
+        return f"undetermined in yaw, the ground is round about x {centre[0]:.2f} m, y {centre[1]:.2f} m"
+    rival = max(rivals, key=lambda h: h.surprisal).T_target_source
+    x, y, yaw = *rival[:2, 2], np.degrees(yaw_of(rival))
+    return f"ambiguous, the pose x {x:.2f} m, y {y:.2f} m, yaw {yaw:.0f} deg fits as well"
 
 
 def _candidate(pair: Pair, weighed: Weighed, refinement: Refinement | None, objection: str) -> LoopCandidate:
@@ -127,7 +153,7 @@ def _candidate(pair: Pair, weighed: Weighed, refinement: Refinement | None, obje
         overlay = Overlay(*pair.maps, T)
         precision = PlanarPrecision(refinement.pivot, refinement.covariance, refinement.strain_variance)
     T_target_source, covariance = lift_to_se3(overlay, precision, calibration)
-    ssd, inliers = compute_ssd(overlay), len(pair.inliers_of(T))
+    ssd, inliers = compute_ssd(overlay), _inliers(pair, T) if refinement else 0
     return LoopCandidate(
         source=pair.source.name,
         target=pair.target.name,
@@ -140,13 +166,20 @@ def _candidate(pair: Pair, weighed: Weighed, refinement: Refinement | None, obje
         score=-weighed.log_nfa if weighed.rivals else NO_EVIDENCE,
         accepted=refinement is not None,
         reason=_reason(weighed, objection, pair.settings.match.max_false_loops),
-        found_by=best.found_by,
+        found_by="dense",
         correlation=best.agreement.correlation,
         log_nfa=weighed.log_nfa,
         inlier_score=inliers * max(0.0, 1.0 - ssd.ratio),
         source_origin=pair.source.gradient_map.local_origin,
         target_origin=pair.target.gradient_map.local_origin,
     )
+
+
+def _inliers(pair: Pair, T: Array) -> int:
+    """Number of keypoint associations that agree with a pose: a description of loops, no evidence."""
+    associations = associate(pair.source.features, pair.target.features)
+    radius = inlier_radius_of(pair.settings, pair.target.gradient_map)
+    return int(get_inliers(associations, T[None], radius).sum())
 
 
 def _reason(weighed: Weighed, objection: str, allowed: float) -> str:

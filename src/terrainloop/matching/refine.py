@@ -8,7 +8,7 @@ import numpy as np
 
 from terrainloop import _core
 from terrainloop.config import Calibration
-from terrainloop.geometry import Array, se2
+from terrainloop.geometry import Array, rotation_about, se2
 from terrainloop.gradient_map import GradientMap
 from terrainloop.matching.covariance import block_covariance
 
@@ -99,13 +99,11 @@ class Refinement:
         slopes = np.linalg.solve(normal[3:, 3:], normal[3:, :3])
         x, y, yaw = np.linalg.eigh(normal[:3, :3] - normal[:3, 3:] @ slopes)[1][:, 0]
         away = distance * np.array([x, y, yaw / radius])
-        return self._move(*away) @ self.T_target_source, self._move(*-away) @ self.T_target_source
+        return self._moved(*away), self._moved(*-away)
 
-    def _move(self, dx: float, dy: float, yaw: float) -> Array:
-        """The motion (3, 3) in the target frame by a rotation about the pivot and a shift."""
-        move = se2(0.0, 0.0, yaw)
-        move[:2, 2] = self.pivot - move[:2, :2] @ self.pivot + (dx, dy)
-        return move
+    def _moved(self, dx: float, dy: float, yaw: float) -> Array:
+        """The pose (3, 3) after a rotation about the pivot and a shift in the target frame."""
+        return se2(dx, dy, 0.0) @ rotation_about(self.pivot, yaw) @ self.T_target_source
 
     def _solve(self, jacobian: Array) -> tuple[Array, Array]:
         """Least-squares parameters (P,) and the normal matrix (P, P)."""

@@ -4,9 +4,12 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
+import numpy as np
+
 from terrainloop.config import Settings
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
+from terrainloop.geometry import Array
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.by_inliers import compare_by_inliers
@@ -66,7 +69,7 @@ def compare_many(
     targets: Sequence[MapEntry],
     settings: Settings,
     *,
-    pairs: float = 1,
+    pairs: float | Array = 1,
     workers: int = 1,
 ) -> list[LoopCandidate]:
     """Compare one submap with several.
@@ -77,8 +80,8 @@ def compare_many(
         The query.
     targets : sequence of MapEntry
     settings : Settings
-    pairs : float
-        Number of pairs compared in the run; `max_false_loops` is for all of them.
+    pairs : float or array, (N,)
+        Number of pairs that `max_false_loops` is shared among, for all targets or for each.
     workers : int
         Threads; the result does not depend on their number.
 
@@ -90,10 +93,11 @@ def compare_many(
     with ThreadPoolExecutor(workers) as pool:
         if settings.match.decision == "inliers":
             return list(pool.map(partial(compare_by_inliers, source, settings=settings), targets))
+        of_each = np.broadcast_to(pairs, len(targets))
         candidates: dict[int, LoopCandidate] = {}
         for query, indices in _queries(source, targets, settings):
-            work = partial(compare_by_evidence, query, settings=settings, pairs=pairs)
-            found = pool.map(work, [targets[index] for index in indices])
+            work = partial(compare_by_evidence, query, settings=settings)
+            found = pool.map(work, [targets[index] for index in indices], of_each[indices])
             candidates |= zip(indices, found, strict=True)
     return [candidates[index] for index in range(len(targets))]
 

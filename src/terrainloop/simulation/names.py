@@ -3,7 +3,7 @@
 WORLDS = (
     *("etna", "morocco", "mars", "flat", "ripples"),
     *("craters", "sparse_rocks", "boulders", "equal_rocks"),
-    *("lattice", "ruts", "polygons", "terraces", "built"),
+    *("lattice", "ruts", "polygons", "terraces", "built", "symmetric"),
 )
 """Worlds of `make_terrain`."""
 

@@ -240,6 +240,27 @@ def boxes(rng: Generator, grid: Grid, *, per_area: float, sides: tuple[float, fl
     return heights
 
 
+def symmetric_figure(rng: Generator, grid: Grid, *, height: float) -> Array:
+    """A figure in the middle of the grid that a rotation, or a shift, maps onto itself.
+
+    It is one of: two to six equal mounds on a circle, one to three straight walls that cross at equal angles,
+    concentric rings.
+    """
+    heading, offset = rng.uniform(0, np.pi), rng.uniform(-1, 1, 2)
+    x = np.arange(grid.size) * grid.resolution - 0.5 * grid.extent
+    z = (x - offset[0] + 1j * (x - offset[1])[:, None]) * np.exp(1j * heading)
+    kind, order = rng.integers(3), rng.integers(2, 7)
+    if kind == 0:
+        nodes = 1.3 * np.exp(2j * np.pi * np.arange(order) / order)
+        figure = sum(np.exp(-0.5 * (np.abs(z - node) / 0.25) ** 2) for node in nodes)
+    elif kind == 1:
+        walls = np.exp(1j * np.pi * np.arange(order // 2) / (order // 2))
+        figure = np.max([np.exp(-0.5 * ((z * wall).imag / 0.2) ** 2) for wall in walls], axis=0)
+    else:
+        figure = np.cos(2 * np.pi * np.abs(z) / 1.2) * np.exp(-((np.abs(z) / 3) ** 4))
+    return np.asarray(height * figure)
+
+
 def _around(grid: Grid, centre: Array, reach: float) -> tuple[tuple[slice, slice], Array, Array]:
     """The nodes within ``reach`` of a centre along x and y, and their offsets from it along x and along y."""
     x = np.arange(grid.size) * grid.resolution

@@ -106,3 +106,8 @@ def terraces(rng: Generator, grid: Grid) -> Array:
 def built(rng: Generator, grid: Grid) -> Array:
     """A paved site with kerbs, walls and boxes: nothing but straight, parallel edges."""
     return flat(rng, grid) + relief.boxes(rng, grid, per_area=0.05, sides=(0.3, 5.0))
+
+
+def symmetric(rng: Generator, grid: Grid) -> Array:
+    """One figure on bare ground, such that more than one pose fits: mounds in a circle, walls or rings."""
+    return flat(rng, grid) + relief.symmetric_figure(rng, grid, height=0.15)
