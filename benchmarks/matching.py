@@ -1,6 +1,6 @@
 """Benchmarks of matching: recall by method, false alarms, covariance, time.
 
-    python benchmarks/matching.py recall MISSION...   keypoints, dense, both: by shared ground and direction
+    python benchmarks/matching.py recall MISSION...   keypoints, dense: by shared ground and direction
     python benchmarks/matching.py null MISSION...     submaps of different missions, which share nothing
     python benchmarks/matching.py errors MISSION...   errors of accepted loops against their covariance
     python benchmarks/matching.py time MISSION        one query against 14 submaps, by stage
@@ -57,17 +57,7 @@ EVIDENCE = Settings()
 INLIERS = Settings.model_validate({"match": {"decision": "inliers"}})
 
 
-def proposing(dense, ransac):
-    """The default with other numbers of hypotheses from the search, and of inlier sets from the keypoints."""
-    return Settings.model_validate({"calibration": {"dense_hypotheses": dense, "ransac_hypotheses": ransac}})
-
-
-METHODS = {
-    "keypoints, inlier count": INLIERS,
-    "keypoints, evidence": proposing(0, 20),
-    "dense, evidence": proposing(2, 0),
-    "both, evidence (default)": EVIDENCE,
-}
+METHODS = {"keypoints, inlier count": INLIERS, "dense, evidence (default)": EVIDENCE}
 
 
 @lru_cache(maxsize=4)
@@ -122,8 +112,8 @@ def judged(pool, folder, method):
 
 def recall(folders, _):
     print("| mission | method | " + " | ".join(f"IoU {a}-{b}: best, accepted" for a, b in BANDS), end="")
-    print(" | same way | opposite | across | loops | wrong | disjoint | found by dense / sparse |")
-    print("|---" * 11 + "|")
+    print(" | same way | opposite | across | loops | wrong | disjoint |")
+    print("|---" * 10 + "|")
     total = defaultdict(list)
     with processes() as pool:
         for folder in folders:
@@ -143,7 +133,6 @@ def recall_row(pairs, turned):
     right = np.array([p.pose_is_right for p in pairs])
     accepted = np.array([bool(p.candidate) for p in pairs])
     turn = np.array([turned[p.candidate.source, p.candidate.target] for p in pairs])
-    dense = np.array([p.candidate.found_by == "dense" for p in pairs])
     first_false = score[~right].max(initial=-np.inf)  # also where they do share ground
     row = []
     for low, high in BANDS:
@@ -152,15 +141,7 @@ def recall_row(pairs, turned):
     for low, high in ((0, 45), (135, 180), (45, 135)):
         way = (overlap > 0.1) & (np.degrees(turn) >= low) & (np.degrees(turn) <= high)
         row.append(share(right & accepted, way))
-    good = right & accepted
-    return [
-        *row,
-        accepted.sum(),
-        (accepted & ~right).sum(),
-        (accepted & (overlap <= 0)).sum(),
-        (good & dense).sum(),
-        (good & ~dense).sum(),
-    ]
+    return [*row, accepted.sum(), (accepted & ~right).sum(), (accepted & (overlap <= 0)).sum()]
 
 
 def share(what, of):
@@ -170,11 +151,7 @@ def share(what, of):
 def cells(row):
     best = f"{row[0]:.2f}, {row[1]:.2f} | {row[2]:.2f}, {row[3]:.2f}"
     ways = " | ".join(f"{value:.2f}" for value in row[4:7])
-    return (
-        f"{best} | {ways} | "
-        + " | ".join(f"{int(n)}" for n in row[7:10])
-        + f" | {int(row[10])} / {int(row[11])}"
-    )
+    return f"{best} | {ways} | " + " | ".join(f"{int(n)}" for n in row[7:10])
 
 
 def null(folders, figure):
@@ -229,7 +206,7 @@ def errors(folders, figure):
     all_squares = defaultdict(list)
     with processes() as pool:
         for folder in folders:
-            pairs, _ = judged(pool, folder, "both, evidence (default)")
+            pairs, _ = judged(pool, folder, "dense, evidence (default)")
             _, records, poses, _ = mapped(folder)
             order = {record.name: index for index, record in enumerate(records)}
             squares, plane, rest = all_squares[folder.name], [], []
@@ -298,7 +275,7 @@ def query_time(folders, _):
             print(f"{threads} thread(s): median {1e3 * np.median(times):.0f} ms")
         stages = (
             *((register, name) for name in ("search_grid", "rotate", "Query")),
-            *((hypotheses, name) for name in ("search", "associate", "propose", "refine")),
+            *((hypotheses, name) for name in ("search", "refine")),
             *((decision, name) for name in ("propose_hypotheses", "refine", "_objection", "_candidate")),
         )
         with ExitStack() as stack:

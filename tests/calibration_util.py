@@ -143,7 +143,7 @@ def decided(pairs, settings):
 
     def decide(pair):
         query = SimpleNamespace(entry=pair.source, pair=pair)
-        return decision.compare_by_evidence(query, pair.target, settings, 1)
+        return decision.compare_by_evidence(query, pair.target, 1, settings)
 
     def again(query, target, settings):
         return replace(query.pair, settings=settings)

@@ -12,7 +12,7 @@ from terrainloop.detection import detector as detecting
 from terrainloop.detection.detector import LoopDetector, fit_database, map_submap
 from terrainloop.detection.mission import detect_mission
 from terrainloop.errors import TerrainLoopError
-from terrainloop.geometry import parameters_of, transform
+from terrainloop.geometry import parameters_of, se3, transform
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.io.missions import load_mission
 from terrainloop.io.results import write_loops
@@ -158,7 +158,7 @@ def told(monkeypatch):
 
     def compare_many(source, targets, settings, *, pairs, workers):
         if targets:
-            kept[source.name] = list(pairs)
+            kept[source.name] = np.broadcast_to(pairs, len(targets)).tolist()
         return [LoopCandidate.without_transform(source.name, t.name, "not compared") for t in targets]
 
     monkeypatch.setattr(detecting, "compare_many", compare_many)

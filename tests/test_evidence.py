@@ -1,18 +1,19 @@
 """How sure a match is: the chance of a correlation, the covariance of a pose, and the decision itself."""
 
+import re
 from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 import pytest
 from conftest import STRICT, flat, map_of, ridges, with_match
-from scipy.stats import beta, binom
+from scipy.stats import beta
 
 from terrainloop.config import Calibration
 from terrainloop.entry import MapEntry
 from terrainloop.geometry import inverse, se2, se3, transform, yaw_of
 from terrainloop.loop import NO_EVIDENCE
-from terrainloop.matching import hypotheses, significance
+from terrainloop.matching import significance
 from terrainloop.matching.covariance import block_covariance
 from terrainloop.matching.refine import refine
 from terrainloop.matching.register import compare, register
@@ -342,6 +343,49 @@ def test_two_places_that_look_the_same_are_ambiguous(world):
     assert "ambiguous" in candidate.reason
     assert candidate.score > 5  # not by chance
     assert judge(world(0).map(origin=(-1.9, -1.9), shape=(48, 47)), world(0).map())
+
+
+MIDDLE = np.array([0.5, 0.2])
+
+
+def rings(xy):
+    """Concentric about the middle."""
+    offset = xy - MIDDLE
+    r = np.maximum(np.hypot(*offset.T), 1e-9)
+    return 0.1 * np.cos(4 * r), -0.4 * np.sin(4 * r)[:, None] * offset / r[:, None]
+
+
+def mounds(count):
+    """Equal mounds on a circle about the middle."""
+    angle = 2 * np.pi * np.arange(count) / count
+
+    def ground(xy):
+        offset = xy[:, None] - MIDDLE - 1.4 * np.c_[np.cos(angle), np.sin(angle)]
+        bump = 0.2 * np.exp(-0.5 * (offset**2).sum(-1) / 0.3**2)
+        return bump.sum(1), -(bump[..., None] * offset / 0.3**2).sum(1)
+
+    return ground
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 6])
+def test_symmetric_ground_is_ambiguous_and_the_other_pose_is_named(count):
+    T = se2(0.4, -0.3, 0.7)
+    candidate = judge(map_of(mounds(count), T, **BIG), map_of(mounds(count), **BIG))
+    assert candidate.reason.startswith("ambiguous")
+    x, y, yaw = (float(n) for n in re.findall(r"-?\d+\.?\d*", candidate.reason)[:3])
+    found = candidate.T_target_source
+    turn = np.radians(yaw) - yaw_of(found)
+    assert np.cos(count * turn) > 0.99
+    assert np.cos(turn) < 0.9
+    # Both poses put the middle where it is.
+    named = transform(se2(x, y, np.radians(yaw)), transform(inverse(T), MIDDLE))
+    assert np.hypot(*(named - MIDDLE)) < 0.1
+
+
+def test_round_ground_leaves_the_yaw_open():
+    candidate = judge(map_of(rings, se2(0.4, -0.3, 0.7), **BIG), map_of(rings, **BIG))
+    assert candidate.reason.startswith("undetermined in yaw, the ground is round about x 0.5")
+    assert np.isnan(candidate.covariance).all()
 
 
 def test_maps_that_cannot_share_enough_are_not_judged(world):

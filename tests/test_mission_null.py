@@ -26,16 +26,17 @@ def entry_of(ground, name, settings, T_planar=None):
     return MapEntry.of(replace(RECORD, name=name), m, settings)
 
 
-def mounds(seed, count=4):
-    """A few mounds of one size on smooth ground: unrelated places look alike."""
+def mounds(seed):
+    """Three mounds in much the same triangle on smooth ground: unrelated places look alike."""
     rng = np.random.default_rng(seed)
-    centres = rng.uniform(-1.4, 1.4, (count, 2))
+    triangle = np.array([[-0.9, -0.5], [0.9, -0.5], [0.4, 0.9]]) + rng.normal(0, 0.12, (3, 2))
+    centres = transform(se2(*rng.uniform(-0.3, 0.3, 2), rng.uniform(0, 2 * np.pi)), triangle)
     ripple = rng.uniform(0, 2 * np.pi, (12, 2))
 
     def ground(xy):
         offsets = xy[:, None] - centres
-        bumps = 0.1 * np.exp(-0.5 * (offsets**2).sum(-1) / 0.2**2)
-        slope = -(offsets / 0.2**2 * bumps[..., None]).sum(1)
+        bumps = 0.1 * np.exp(-0.5 * (offsets**2).sum(-1) / 0.3**2)
+        slope = -(offsets / 0.3**2 * bumps[..., None]).sum(1)
         waves = np.cos(6.0 * (xy @ _directions(ripple).T) + ripple[:, 1])
         return bumps.sum(1), slope + 0.004 * waves @ _directions(ripple)
 

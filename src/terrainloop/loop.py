@@ -30,7 +30,8 @@ class LoopCandidate(ReadOnlyArrays):
         Covariance of (x, y, z, roll, pitch, yaw), the parameters of `T_local`, in metres and radians. NaN
         where no transform could be estimated. `information` converts it for GTSAM and g2o.
     inliers : int
-        Associations that agree with the transform (n of Algorithm 1).
+        Associations that agree with the transform (n of Algorithm 1); counted for loops only where a run
+        decides by evidence.
     ssd : float
         Weighted sum of squared gradient differences (h of Algorithm 1), m^-4.
     ssd_ratio : float
@@ -44,7 +45,7 @@ class LoopCandidate(ReadOnlyArrays):
     reason : str
         Why it was accepted or rejected, in words.
     found_by : {"dense", "sparse", ""}
-        What proposed the pose: the search of all poses, or the keypoints.
+        What proposed the pose: the search of all poses, or keypoints (Algorithm 1).
     correlation : float
         Correlation of the two gradient fields over the shared ground, -1 to 1; NaN if not computed.
     log_nfa : float

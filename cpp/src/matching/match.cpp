@@ -23,7 +23,7 @@ using namespace matching;
 
 constexpr int kRejectedStep = 3;       // every third row and column is enough to show a rejected pair
 constexpr double kNoEvidence = -10.0;  // score of a pair for which no hypothesis could be weighed
-constexpr int kTurns = 6;  // of 1/7: none maps ground that is the same after 1/2 ... 1/6 onto itself
+constexpr int kTurns = 7;  // parts of a full turn: only round ground looks the same after each of them
 constexpr double kPi = 3.141592653589793;
 constexpr double kLn10 = 2.302585092994046;
 constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
@@ -77,9 +77,9 @@ std::string fixed(double value, int decimals) {
   return text.str();
 }
 
-/// Which poses explain a pair as well as T does, in words.
-std::string ambiguity(const Pair& pair, const Matrix3d& T, const std::vector<Hypothesis>& rivals,
-                      double rivalling) {
+/// Which poses explain a pair as well as the best, in words.
+std::string ambiguity(const Pair& pair, const Hypothesis& best, const std::vector<Hypothesis>& rivals) {
+  const Matrix3d& T = best.T_target_source;
   Matrix3d motion = Matrix3d::Identity();
   const Hypothesis* strongest = &rivals.front();
   for (const Hypothesis& rival : rivals) {
@@ -89,11 +89,12 @@ std::string ambiguity(const Pair& pair, const Matrix3d& T, const std::vector<Hyp
   }
   const Eigen::Matrix2d turn = Eigen::Matrix2d::Identity() - motion.topLeftCorner<2, 2>();
   const Vector2d centre = turn.completeOrthogonalDecomposition().solve(motion.topRightCorner<2, 1>());
-  std::vector<double> turned;
-  for (int k = 1; k <= kTurns; ++k)
-    turned.push_back(pair.weigh(rotation_about(centre, 2.0 * kPi * k / (kTurns + 1)) * T).surprisal);
+  std::array<double, kTurns - 1> turned;
+  for (int k = 1; k < kTurns; ++k)
+    turned[k - 1] = pair.weigh(rotation_about(centre, 2.0 * kPi * k / kTurns) * T).surprisal;
   std::sort(turned.begin(), turned.end());
-  if (0.5 * (turned[kTurns / 2 - 1] + turned[kTurns / 2]) > rivalling)
+  const double median = 0.5 * (turned[(kTurns - 1) / 2 - 1] + turned[(kTurns - 1) / 2]);
+  if (median > pair.calibration.ambiguity_ratio * best.surprisal)
     return "undetermined in yaw, the ground is round about x " + fixed(centre.x(), 2) + " m, y " +
            fixed(centre.y(), 2) + " m";
   const Matrix3d& rival = strongest->T_target_source;
@@ -114,7 +115,7 @@ std::string objection_to(const Pair& pair, const Weighed& weighed,
   std::vector<Hypothesis> equal;
   for (const Hypothesis& rival : weighed.rivals)
     if (rival.surprisal > rivalling && !pair.same_place(rival.T_target_source, T)) equal.push_back(rival);
-  if (!equal.empty()) return ambiguity(pair, T, equal, rivalling);
+  if (!equal.empty()) return ambiguity(pair, best, equal);
   if (!refinement || !pair.same_place(refinement->T_target_source(), T))
     return "undetermined, the refinement converges elsewhere";
   if (refinement->covariance().hasNaN()) return "undetermined, too little ground to determine the pose";

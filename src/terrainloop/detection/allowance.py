@@ -53,10 +53,9 @@ def pairs_equivalent(share: float, plausible: NDArray[np.bool_]) -> Array:
     -------
     array, (N,)
     """
-    weights = np.full(len(plausible), 1.0 / max(len(plausible), 1))
-    if plausible.any():
-        weights = 0.5 * weights + 0.5 * plausible / plausible.sum()
-    return np.asarray(1.0 / (share * weights))
+    evenly = np.full(len(plausible), share / max(len(plausible), 1))
+    shares = 0.5 * evenly + 0.5 * share * plausible / plausible.sum() if plausible.any() else evenly
+    return np.asarray(1.0 / shares)
 
 
 def plausible_by_odometry(
@@ -76,23 +75,21 @@ def plausible_by_odometry(
     array, (N,)
         True also where odometry or the submap's extent is not known, and between sessions.
     """
-    line = [*stored, *since, query]
-    positions = np.array([_position(entry) for entry in line])
-    steps = np.nan_to_num(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+    discs = [_disc_of(entry) for entry in [*stored, *since, query]]
+    middles, radii = np.array([disc[:2] for disc in discs]), np.array([disc[2] for disc in discs])
+    steps = np.nan_to_num(np.linalg.norm(np.diff(middles, axis=0), axis=1))
     travelled = np.cumsum(steps[::-1])[::-1][: len(stored)]
-    reach = np.array([_reach(entry) for entry in line])
-    away = np.linalg.norm(positions[: len(stored)] - positions[-1], axis=1)
-    apart = away > reach[: len(stored)] + reach[-1] + DRIFT * travelled
+    away = np.linalg.norm(middles[: len(stored)] - middles[-1], axis=1)
+    apart = away > radii[: len(stored)] + radii[-1] + DRIFT * travelled
     same_session = np.array([entry.record.session == query.record.session for entry in stored], dtype=bool)
     return ~(apart & same_session)
 
 
-def _position(entry: MapEntry) -> Array:
-    odometry = entry.record.odometry
-    return np.full(2, np.nan) if odometry is None else odometry[:2, 3]
-
-
-def _reach(entry: MapEntry) -> float:
-    """Largest distance of the submap's points from its frame's origin, metres."""
-    hull = entry.record.hull
-    return float(np.linalg.norm(hull, axis=1).max()) if len(hull) else np.inf
+def _disc_of(entry: MapEntry) -> tuple[float, float, float]:
+    """x, y and radius, metres, of a disc that holds the submap in the world by odometry; NaN if unknown."""
+    hull, odometry = entry.record.hull, entry.record.odometry
+    if odometry is None or not len(hull):
+        return np.nan, np.nan, np.nan
+    middle = hull.mean(axis=0)
+    x, y, *_ = odometry @ (*middle, 0.0, 1.0)
+    return x, y, float(np.linalg.norm(hull - middle, axis=1).max())

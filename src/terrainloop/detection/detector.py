@@ -7,6 +7,7 @@ from numbers import Real
 from threading import Lock
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrainloop.config import Settings
 from terrainloop.detection.allowance import pairs_equivalent, plausible_by_odometry, share_of_query
@@ -29,6 +30,7 @@ logger = logging.getLogger(__name__)
 FEATURE_BYTES_PER_PIXEL = 250  # of SIFT, at the peak (docs/solver.md)
 
 NULL_PAIRS_PER_QUERY = 12  # mirror images compared for one submap, at most
+ENOUGH_APART = 100  # pairs that odometry puts apart, to measure the null on them alone
 NEVER_SIGNIFICANT = 1e100  # pairs; mirror images need no thorough refinement
 
 PairSink = Callable[[LoopCandidate], object]
@@ -154,10 +156,13 @@ class LoopDetector:
                 mend="name each submap differently",
             )
         stored = list(self.entries.values())[: max(0, len(self.entries) - self.settings.skip_recent)]
-        pairs = self._pairs_equivalent(query, stored)
+        plausible = plausible_by_odometry(query, stored, list(self.entries.values())[len(stored) :])
+        known = self.expected_pairs
+        share = len(stored) / known if known else share_of_query(max(len(stored), 1))
+        pairs = pairs_equivalent(share, plausible)
         candidates = compare_many(query, stored, self.settings, pairs=pairs, workers=self.workers)
         if self.settings.match.decision == "evidence":
-            null = self._null_with(query, stored)
+            null = self._null_with(query, stored, plausible)
             candidates = [
                 by_mission_null(candidate, null, self.settings, among)
                 for candidate, among in zip(candidates, pairs, strict=True)
@@ -169,20 +174,14 @@ class LoopDetector:
         self.loops += loops
         return loops
 
-    def _pairs_equivalent(self, query: MapEntry, stored: Sequence[MapEntry]) -> Array:
-        """Among how many pairs `max_false_loops` is shared, as seen by each pair of a query."""
-        if not stored:
-            return np.empty(0)
-        known = self.expected_pairs
-        share = len(stored) / known if known else share_of_query(len(stored))
-        since = list(self.entries.values())[len(stored) :]
-        return pairs_equivalent(share, plausible_by_odometry(query, stored, since))
-
-    def _null_with(self, query: MapEntry, stored: Sequence[MapEntry]) -> MissionNull:
+    def _null_with(
+        self, query: MapEntry, stored: Sequence[MapEntry], plausible: NDArray[np.bool_]
+    ) -> MissionNull:
         """The null of the mission so far; a query adds to it while it is not well known."""
         wanted = 0 if self._null_is_known else self.settings.calibration.null_pairs
         if len(self.null_scores) < wanted and stored:
-            sample = stored[:: -(-len(stored) // NULL_PAIRS_PER_QUERY)]
+            sample = [entry for entry, near in zip(stored, plausible, strict=True) if not near] or stored
+            sample = sample[:: -(-len(sample) // NULL_PAIRS_PER_QUERY)]
             self.null_scores += null_scores(query, sample, self.settings, workers=self.workers)
         return MissionNull.of(self.null_scores, self.settings.calibration)
 
@@ -222,8 +221,18 @@ def sample_null(
     workers: int = 1,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[float]:
-    """Scores of mirror images for pairs spread evenly over those that a mission compares."""
-    pairs = [(i, j) for i in range(len(entries)) for j in range(i - settings.skip_recent)]
+    """Scores of mirror images for pairs spread evenly over those that a mission compares.
+
+    Over those that odometry puts apart, if they are enough: ground that is seen twice and is symmetric in
+    parts resembles its own mirror image.
+    """
+    pairs, apart = [], []
+    for i, entry in enumerate(entries):
+        stored = max(0, i - settings.skip_recent)
+        plausible = plausible_by_odometry(entry, entries[:stored], entries[stored:i])
+        pairs += [(i, j) for j in range(stored)]
+        apart += [(i, j) for j in np.flatnonzero(~plausible).tolist()]
+    pairs = apart if len(apart) >= ENOUGH_APART else pairs
     count = min(len(pairs), settings.calibration.null_pairs)
     chosen: dict[int, list[MapEntry]] = {}
     for k in np.linspace(0, len(pairs) - 1, count).astype(int) if count else ():

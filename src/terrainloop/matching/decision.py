@@ -19,7 +19,7 @@ from terrainloop.matching.significance import log_num_tests
 from terrainloop.matching.ssd import compute_ssd
 
 REJECTED_STEP = 3  # every third row and column is enough to describe a rejected pair
-TURNS = 2 * np.pi * np.arange(1, 7) / 7  # none maps ground onto itself that is the same after 1/2, 1/3 ... 1/6
+TURNS = 7  # by equal parts of a full turn: only round ground looks the same after each of them
 UNKNOWN = np.full((3, 3), np.nan)
 LN_10 = float(np.log(10.0))
 
@@ -118,7 +118,7 @@ def _objection(pair: Pair, weighed: Weighed, refinement: Refinement | None) -> s
         h for h in weighed.rivals if h.surprisal > rivalling and not pair.same_place(h.T_target_source, T)
     ]
     if equal:
-        return _ambiguity(pair, T, equal, rivalling)
+        return _ambiguity(pair, best, equal)
     if refinement is None or not pair.same_place(refinement.T_target_source, T):
         return "undetermined, the refinement converges elsewhere"
     if np.isnan(refinement.covariance).any():
@@ -129,12 +129,14 @@ def _objection(pair: Pair, weighed: Weighed, refinement: Refinement | None) -> s
     return ""
 
 
-def _ambiguity(pair: Pair, T: Array, rivals: list[Hypothesis], rivalling: float) -> str:
-    """Which poses explain a pair as well as T does, in words."""
+def _ambiguity(pair: Pair, best: Hypothesis, rivals: list[Hypothesis]) -> str:
+    """Which poses explain a pair as well as the best, in words."""
+    T, round_ground = best.T_target_source, pair.settings.calibration.ambiguity_ratio * best.surprisal
     motion = max((h.T_target_source @ inverse(T) for h in rivals), key=lambda motion: abs(yaw_of(motion)))
     centre = np.linalg.lstsq(np.eye(2) - motion[:2, :2], motion[:2, 2], rcond=None)[0]
-    turned = [pair.weigh(rotation_about(centre, angle) @ T).surprisal for angle in TURNS]
-    if np.median(turned) > rivalling:
+    angles = 2 * np.pi * np.arange(1, TURNS) / TURNS
+    turned = [pair.weigh(rotation_about(centre, angle) @ T).surprisal for angle in angles]
+    if np.median(turned) > round_ground:
         return f"undetermined in yaw, the ground is round about x {centre[0]:.2f} m, y {centre[1]:.2f} m"
     rival = max(rivals, key=lambda h: h.surprisal).T_target_source
     x, y, yaw = *rival[:2, 2], np.degrees(yaw_of(rival))
