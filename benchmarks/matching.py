@@ -33,7 +33,7 @@ from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from terrainloop import Settings, Submap
-from terrainloop.detection.detector import fit_database, map_submap
+from terrainloop.detection.detector import NEVER_SIGNIFICANT, fit_database, map_submap
 from terrainloop.detection.mission import MissionMapping
 from terrainloop.evaluation.overlap import world_boxes
 from terrainloop.evaluation.pairs import evaluate_pairs
@@ -156,12 +156,11 @@ def cells(row):
 
 def null(folders, figure):
     """Expected and observed false alarms over pairs of submaps of different missions."""
-    loosened = Settings.model_validate({"match": {"max_false_loops": 1e6}})  # so that every pair is refined
     scores, accepted = defaultdict(list), 0
     with processes() as pool:
         for a, b in combinations(folders, 2):
             others = list(range(len(mapped(b)[0])))
-            jobs = [(loosened, a, i, b, others, 1.0) for i in range(len(mapped(a)[0]))]
+            jobs = [(EVIDENCE, a, i, b, others, NEVER_SIGNIFICANT) for i in range(len(mapped(a)[0]))]
             for found in pool.map(compare_all, jobs):
                 scores[" ".join(sorted({a.name.split("_")[0], b.name.split("_")[0]}))] += [
                     c.score for c in found
