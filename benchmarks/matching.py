@@ -33,7 +33,13 @@ from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from terrainloop import Settings, Submap
-from terrainloop.detection.detector import NEVER_SIGNIFICANT, fit_database, map_submap
+from terrainloop.detection.detector import (
+    NEVER_SIGNIFICANT,
+    LoopDetector,
+    fit_database,
+    map_submap,
+    sample_null,
+)
 from terrainloop.detection.mission import MissionMapping
 from terrainloop.evaluation.overlap import world_boxes
 from terrainloop.evaluation.pairs import evaluate_pairs
@@ -57,7 +63,8 @@ EVIDENCE = Settings()
 INLIERS = Settings.model_validate({"match": {"decision": "inliers"}})
 
 
-METHODS = {"keypoints, inlier count": INLIERS, "dense, evidence (default)": EVIDENCE}
+DEFAULT = "evidence (default)"
+METHODS = {"keypoints, inlier count": INLIERS, DEFAULT: EVIDENCE}
 
 
 @lru_cache(maxsize=4)
@@ -92,16 +99,27 @@ def processes():
     return ProcessPoolExecutor(2, mp_context=get_context("spawn"))
 
 
-def judged(pool, folder, method):
-    """Every pair of a mission that odometry does not connect, evaluated against the ground truth."""
-    submaps, records, poses, sessions = mapped(folder)
-    jobs = []
-    for i, submap in enumerate(submaps):
-        others = [
-            j for j in range(i - 1) if sessions is None or sessions[submap.name] != sessions[submaps[j].name]
-        ]
-        jobs.append((METHODS[method], folder, i, folder, others, len(submaps) * (len(submaps) - 1) / 2))
-    candidates = [c for found in pool.map(compare_all, jobs) for c in found]
+def detected(job):
+    """Every pair of a mission, as 'terrainloop detect --all-pairs' decides it."""
+    folder, method = job
+    cv2.setNumThreads(1)
+    entries, settings, pairs = mapped(folder)[0], METHODS[method].model_copy(update={"skip_recent": 0}), []
+    with threadpool_limits(1):
+        by_evidence = settings.match.decision == "evidence"
+        detector = LoopDetector(
+            settings,
+            expected_pairs=len(entries) * (len(entries) - 1) // 2,
+            null_scores=sample_null(entries, settings) if by_evidence else (),
+            on_pair=pairs.append,
+        )
+        for entry in entries:
+            detector.add_entry(entry)
+    return pairs
+
+
+def judged(folder, candidates):
+    """Pairs of a mission that odometry does not connect, evaluated against the truth; how they are turned."""
+    _, records, poses, sessions = mapped(folder)
     turned = {
         (records[i].name, records[j].name): abs(yaw_of(inverse(poses[j]) @ poses[i]))
         for i in range(len(poses))
@@ -116,12 +134,12 @@ def recall(folders, _):
     print("|---" * 10 + "|")
     total = defaultdict(list)
     with processes() as pool:
-        for folder in folders:
-            for method in METHODS:
-                pairs, turned = judged(pool, folder, method)
-                row = recall_row(pairs, turned)
-                total[method].append(row)
-                print(f"| {folder.name} | {method} | {cells(row)} |", flush=True)
+        jobs = [(folder, method) for folder in folders for method in METHODS]
+        for (folder, method), candidates in zip(jobs, pool.map(detected, jobs), strict=True):
+            pairs, turned = judged(folder, candidates)
+            row = recall_row(pairs, turned)
+            total[method].append(row)
+            print(f"| {folder.name} | {method} | {cells(row)} |", flush=True)
     for method, rows in total.items():
         mean = [np.nanmean(values) for values in zip(*(row[:7] for row in rows), strict=True)]
         print(f"| mean, sums | {method} | {cells([*mean, *np.sum([row[7:] for row in rows], axis=0)])} |")
@@ -204,8 +222,9 @@ def errors(folders, figure):
     print("|---" * 9 + "|")
     all_squares = defaultdict(list)
     with processes() as pool:
-        for folder in folders:
-            pairs, _ = judged(pool, folder, "dense, evidence (default)")
+        results = pool.map(detected, [(folder, DEFAULT) for folder in folders])
+        for folder, candidates in zip(folders, results, strict=True):
+            pairs, _ = judged(folder, candidates)
             _, records, poses, _ = mapped(folder)
             order = {record.name: index for index, record in enumerate(records)}
             squares, plane, rest = all_squares[folder.name], [], []
