@@ -41,6 +41,7 @@ AFTER_SEARCH = {
     "ambiguity_ratio",
     "ambiguity_chance",
     "equivalence_ratio",
+    "min_participation",
     "dense_hypotheses",
     "block",
     "usual_strain",

@@ -131,6 +131,20 @@ def turned(ground, T=TURNED):
     return map_of(ground, T, **BIG), map_of(ground, **BIG)
 
 
+def same_on_one_side():
+    """Large maps that show the same ground on a strip and different ground beside it."""
+
+    def ground(seed):
+        def of(xy):
+            strip = xy[:, 0] < -4.0
+            (height, slope), (other, other_slope) = heights_and_slopes(0)(xy), heights_and_slopes(seed)(xy)
+            return np.where(strip, height, other), np.where(strip[:, None], slope, other_slope)
+
+        return of
+
+    return tuple(map_of(ground(seed), **LARGE) for seed in (3, 4))
+
+
 SCENES = {
     "a loop": lambda: (World.of(0).map(TURNED, **BIG), World.of(0).map(**BIG)),
     "other ground": lambda: (World.of(0).map(**BIG), World.of(1).map(**BIG)),
@@ -142,6 +156,7 @@ SCENES = {
     "crest": crest,
     "long crests": lambda: turned(long_crests),
     "ridges, not turned": lambda: turned(ridges(1), np.eye(3)),
+    "same on one side": same_on_one_side,
     "full of holes": full_of_holes,
     "flat": lambda: turned(flat),
     "tiny": lambda: same_corner(20),
@@ -158,6 +173,7 @@ REASONS = {
     "crest": "ambiguous",
     "long crests": "undetermined, the match slides",
     "ridges, not turned": "undetermined, too little ground",
+    "same on one side": "uneven agreement",
     "full of holes": "undetermined, the refinement converges elsewhere",
     "flat": "featureless",
     "tiny": "too little ground",
@@ -237,6 +253,8 @@ def test_a_constant_that_moves_breaks_a_promise(name, constant, value):
 
 SCENE_MUTANTS = [
     ("common trace", "min_correlation", 0.0),
+    ("same on one side", "min_participation", 0.1),
+    ("a loop", "min_participation", 0.9),
     ("same ground twice", "ambiguity_ratio", 0.99),
     ("less like ground beside", "ambiguity_ratio", 0.1),
     ("like ground beside", "ambiguity_chance", 1e-16),

@@ -10,7 +10,7 @@ from terrainloop import field as fields_module
 from terrainloop.config import Calibration
 from terrainloop.field import Field, rotate_field
 from terrainloop.geometry import inverse, se2
-from terrainloop.matching.overlay import agreement_at
+from terrainloop.matching.overlay import agreement_at, participation_at, pixel_lookup
 
 SPACING = 0.2
 
@@ -311,3 +311,36 @@ def test_utm_coordinates_keep_the_agreement(world):
     there = agreement_at(*(field_of(m, SPACING) for m in moved), far @ T @ inverse(far))
     assert there.correlation == pytest.approx(here.correlation, abs=0.01)
     assert there.area == pytest.approx(here.area, rel=0.02)
+
+
+def test_participation_is_that_of_the_naive_loop_over_blocks(world):
+    T, side = se2(0.9, -0.6, 0.4), 4
+    source, target = (field_of(world(0).map(pose), SPACING) for pose in (T, np.eye(3)))
+    sums, counts = {}, {}
+    rows, columns = target.valid.shape
+    x, y, valid = rotate_field(source, pixel_lookup(source, target, T), (rows, columns))
+    for row in range(rows):
+        for column in range(columns):
+            if valid[row, column] > 0 and target.valid[row, column] > 0:
+                block = row // side, column // side
+                product = float(x[row, column]) * target.x[row, column]
+                product += float(y[row, column]) * target.y[row, column]
+                sums[block], counts[block] = sums.get(block, 0.0) + product, counts.get(block, 0) + 1
+    squares = sum(sums[block] ** 2 / counts[block] for block in sums)
+    expected = sum(sums.values()) ** 2 / (sum(counts.values()) * squares)
+    assert participation_at(source, target, T, side * SPACING) == pytest.approx(expected)
+    assert 0.5 < expected < 1.0
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5])
+def test_where_part_of_the_ground_agrees_that_part_takes_part(share):
+    rng = np.random.default_rng(3)
+    length = rng.choice([-1.0, 1.0], (2, 64, 64)).astype(np.float32)
+    other = np.where(np.arange(64) < 64 * share, length, rng.permuted(length, axis=2)).astype(np.float32)
+    fields = [Field(*xy, np.ones((64, 64), np.float32), (0.0, 0.0), 0.1, 0.2) for xy in (length, other)]
+    assert participation_at(*fields, np.eye(3), 0.8) == pytest.approx(share, abs=0.03)
+
+
+def test_fields_that_share_nothing_have_no_participation(world):
+    field = field_of(world(0).map(), SPACING)
+    assert participation_at(field, field, se2(50.0, 0.0, 0.0), 0.8) == 0.0

@@ -35,6 +35,7 @@ void visit_numbers(Calibration& c, const Visit& visit) {
   visit("independent_tests", c.independent_tests);
   visit("max_correlation", c.max_correlation);
   visit("min_correlation", c.min_correlation);
+  visit("min_participation", c.min_participation);
   visit("ambiguity_ratio", c.ambiguity_ratio);
   visit("equivalence_ratio", c.equivalence_ratio);
   visit("ambiguity_chance", c.ambiguity_chance);

@@ -164,10 +164,16 @@ class Calibration(_Frozen):
     max_correlation: float = Field(0.999, gt=0, lt=1, description="correlations above it count as this one")
     null_pairs: int = Field(300, ge=0, description="mirror images compared per mission, about")
     null_share: float = Field(0.3, gt=0, lt=1, description="share of them that the tail is fitted to")
+    null_margin: float = Field(
+        1.5, ge=1, description="factor of what their tail exceeds that of the law of one pair by"
+    )
     null_prior: int = Field(20, ge=2, description="scores of the law of one pair that are added to theirs")
     # Decision (section 3)
     min_correlation: float = Field(
         0.25, ge=0, lt=1, description="smallest correlation of the fields of a loop closure"
+    )
+    min_participation: float = Field(
+        0.4, ge=0, lt=1, description="smallest share of the shared ground that the agreement rests on"
     )
     ambiguity_ratio: float = Field(0.5, gt=0, description="surprisal of a rival pose, share of the best's")
     equivalence_ratio: float = Field(

@@ -111,6 +111,10 @@ std::string objection_to(const Pair& pair, const Weighed& weighed,
   if (!weighed.significant()) return "chance explains it";
   if (weighed.rivals.empty())
     return "weak agreement, correlation below " + number(calibration.min_correlation, 6);
+  const double participation =
+      participation_at(pair.source_field, pair.target_field, T, calibration.block * pair.length_scale());
+  if (participation < calibration.min_participation)
+    return "uneven agreement, it rests on " + fixed(100.0 * participation, 0) + "% of the shared ground";
   const double rivalling = weighed.rivalling(calibration);
   std::vector<Hypothesis> equal;
   for (const Hypothesis& rival : weighed.rivals)

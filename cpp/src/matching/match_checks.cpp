@@ -81,12 +81,12 @@ void check_settings(const MatchSettings& settings) {
                     c.ambiguity_chance, c.block, c.usual_strain_samples},
                    1e-6),
           "the numbers of the calibration must be within 1e-6 and 1e6");
-  require(sensible({c.min_correlation, c.usual_strain, c.motion_by_strain[0], c.motion_by_strain[1],
+  require(sensible({c.min_correlation, c.min_participation, c.usual_strain, c.motion_by_strain[0], c.motion_by_strain[1],
                     c.motion_by_strain[2], c.rotation_by_strain[0], c.rotation_by_strain[1],
                     c.rotation_by_strain[2]},
                    0.0),
-          "min_correlation and strains must be within 0 and 1e6");
-  require(c.wraparound <= 1.0 && c.max_correlation < 1.0 && c.min_correlation < 1.0,
+          "min_correlation, min_participation and strains must be within 0 and 1e6");
+  require(c.wraparound <= 1.0 && c.max_correlation < 1.0 && c.min_correlation < 1.0 && c.min_participation < 1.0,
           "wraparound must be at most 1, correlations below 1");
   require(c.max_pixels >= 8 && c.candidates >= 1 && c.dense_hypotheses >= 0,
           "max_pixels must be at least 8, candidates 1, dense_hypotheses 0");

@@ -26,4 +26,9 @@ struct Agreement {
 
 Agreement agreement_at(const Field& source, const Field& target, const Matrix3d& T_target_source);
 
+/// Share of the shared ground that the agreement rests on, 0 to 1: the participation ratio of the sums of the
+/// scalar products over square blocks of ground, metres.
+double participation_at(const Field& source, const Field& target, const Matrix3d& T_target_source,
+                        double block);
+
 }  // namespace terrainloop::matching

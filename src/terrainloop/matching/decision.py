@@ -113,6 +113,9 @@ def _objection(pair: Pair, weighed: Weighed, refinement: Refinement | None) -> s
         return "chance explains it"
     if not weighed.rivals:
         return f"weak agreement, correlation below {calibration.min_correlation:g}"
+    participation = pair.participation(best.T_target_source)
+    if participation < calibration.min_participation:
+        return f"uneven agreement, it rests on {participation:.0%} of the shared ground"
     T, rivalling = best.T_target_source, weighed.rivalling(calibration)
     equal = [
         h for h in weighed.rivals if h.surprisal > rivalling and not pair.same_place(h.T_target_source, T)

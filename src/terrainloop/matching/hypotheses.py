@@ -9,7 +9,7 @@ from terrainloop.entry import MapEntry
 from terrainloop.field import Field
 from terrainloop.geometry import Array, yaw_of
 from terrainloop.gradient_map import GradientMap
-from terrainloop.matching.overlay import Agreement, agreement_at
+from terrainloop.matching.overlay import Agreement, agreement_at, participation_at
 from terrainloop.matching.query import Query
 from terrainloop.matching.refine import ROUGH, refine
 from terrainloop.matching.search import SearchResult, same_place, search
@@ -83,6 +83,11 @@ class Pair:
             return Hypothesis(T, agreement, 0.0)
         samples = agreement.area / null_area
         return Hypothesis(T, agreement, surprisal_of_field(agreement.correlation, samples, calibration))
+
+    def participation(self, T: Array) -> float:
+        """Share of the shared ground that the agreement at a pose rests on."""
+        block = self.settings.calibration.block * self.length_scale
+        return participation_at(self.source_field, self.target_field, T, block)
 
     def refined(self, hypothesis: Hypothesis) -> Hypothesis:
         """The hypothesis at the pose where the gradients agree best, if that has more evidence."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from terrainloop.config import Calibration, Settings
 from terrainloop.entry import MapEntry
+from terrainloop.geometry import Array
 from terrainloop.loop import NO_EVIDENCE, LoopCandidate
 from terrainloop.matching.decision import reason_in_words
 
@@ -51,7 +52,8 @@ class MissionNull:
     share : float
         Share of the pairs of unrelated submaps that exceed it.
     scale : float
-        Mean excess over it, in decades; 0.43, that of the law of one pair, at least.
+        Mean excess over it, in decades; 0.43, that of the law of one pair, at least. What exceeds the law
+        counts `null_margin` times, for what recurs on the ground unmirrored.
     """
 
     threshold: float
@@ -65,14 +67,13 @@ class MissionNull:
         A few scores that the law of one pair predicts (a Gumbel distribution) are added, so that it is the
         null of a mission of which nothing is known yet.
         """
-        count = calibration.null_prior
+        count, share = calibration.null_prior, calibration.null_share
         levels = (np.arange(count) + 0.5) / count
         predicted = -np.log(-np.log(levels)) / LN_10
-        ordered = np.sort(np.concatenate([predicted, np.fromiter(scores, dtype=float)]))[::-1]
-        above = max(2, round(calibration.null_share * len(ordered)))
-        threshold = ordered[above - 1]
-        excess = float((ordered[:above] - threshold).sum() / (above - 1))
-        return cls(float(threshold), above / len(ordered), max(excess, 1.0 / LN_10))
+        _, _, usual = _tail(predicted, share)
+        threshold, share, scale = _tail(np.concatenate([predicted, np.fromiter(scores, dtype=float)]), share)
+        scale += (calibration.null_margin - 1.0) * max(scale - usual, 0.0)
+        return cls(threshold, share, max(scale, 1.0 / LN_10))
 
     def __str__(self) -> str:
         in_thousand = self.threshold + self.scale * np.log(1e3 * self.share)
@@ -81,6 +82,14 @@ class MissionNull:
     def log_nfa(self, score: float) -> float:
         """Decimal logarithm of the number of false alarms in one pair, at a score by the law of one pair."""
         return float(np.log10(self.share) - (score - self.threshold) / (self.scale * LN_10))
+
+
+def _tail(scores: Array, share: float) -> tuple[float, float, float]:
+    """Threshold of about the largest share of scores, their share, and their mean excess over it."""
+    ordered = np.sort(scores)[::-1]
+    above = max(2, round(share * len(ordered)))
+    threshold = float(ordered[above - 1])
+    return threshold, above / len(ordered), float((ordered[:above] - threshold).sum() / (above - 1))
 
 
 def by_mission_null(

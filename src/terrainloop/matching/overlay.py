@@ -115,10 +115,39 @@ def agreement_at(source: Field, target: Field, T_target_source: Array) -> Agreem
     T_target_source : array, (3, 3)
         SE(2).
     """
-    lookup = pixel_lookup(source, target, T_target_source)
-    x, y, valid = rotate_field(source, lookup, target.valid.shape)
-    both = (valid > 0) & (target.valid > 0)
-    x, y, u, v = (image[both].astype(float) for image in (x, y, target.x, target.y))
+    both, x, y, u, v = _shared_vectors(source, target, T_target_source)
     energy = (x @ x + y @ y) * (u @ u + v @ v)
     correlation = float((u @ x + v @ y) / np.sqrt(energy)) if energy > 0 else 0.0
     return Agreement(correlation, float(both.sum()) * target.spacing**2)
+
+
+def participation_at(source: Field, target: Field, T_target_source: Array, block: float) -> float:
+    """Share of the shared ground that the agreement of two fields rests on at a pose, 0 to 1.
+
+    The participation ratio (sum_b s_b)^2 / (n sum_b s_b^2 / n_b) of the sums s_b of the scalar products over
+    blocks of ground, with n_b their numbers of pixels and n that of all: 1 where all blocks agree alike, and
+    k / K where k of K blocks do and the rest is zero.
+
+    Parameters
+    ----------
+    source, target : Field
+    T_target_source : array, (3, 3)
+        SE(2).
+    block : float
+        Side of a block, metres.
+    """
+    both, x, y, u, v = _shared_vectors(source, target, T_target_source)
+    side = max(1, round(block / target.spacing))
+    rows, columns = np.nonzero(both)
+    _, of = np.unique(rows // side * both.shape[1] + columns // side, return_inverse=True)
+    counts, sums = np.bincount(of), np.bincount(of, weights=u * x + v * y)
+    spread = len(rows) * (sums**2 / counts).sum()
+    return float(sums.sum() ** 2 / spread) if spread > 0 else 0.0
+
+
+def _shared_vectors(source: Field, target: Field, T_target_source: Array) -> tuple[Array, ...]:
+    """Mask of the pixels of the target that both observed; there x, y of the source and of the target."""
+    lookup = pixel_lookup(source, target, T_target_source)
+    x, y, valid = rotate_field(source, lookup, target.valid.shape)
+    both = (valid > 0) & (target.valid > 0)
+    return both, *(image[both].astype(float) for image in (x, y, target.x, target.y))
