@@ -9,6 +9,7 @@ from threading import Lock
 import numpy as np
 
 from terrainloop.config import Settings
+from terrainloop.detection.sensor_pattern import SensorPatterns
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import Array
@@ -48,6 +49,9 @@ class LoopDetector:
         Otherwise each query is given less of it than the one before, so that it holds for any number.
     null_scores : sequence of float, optional
         Scores of mirror images, where they are known (see `sample_null`); else measured on the way.
+    sensor_patterns : SensorPatterns, optional
+        Of the submaps that will be added, where these are known; else patterns fixed to the sensor are
+        measured on the way.
     on_pair : callable, optional
         Called with every LoopCandidate as it is decided, rejected ones too; the detector keeps the loops
         only.
@@ -79,6 +83,7 @@ class LoopDetector:
         parameters: Hyperparameters | None = None,
         expected_pairs: int | None = None,
         null_scores: Sequence[float] | None = None,
+        sensor_patterns: SensorPatterns | None = None,
         on_pair: PairSink = lambda candidate: None,
         workers: int = 1,
     ) -> None:
@@ -97,8 +102,14 @@ class LoopDetector:
         self.loops: list[LoopCandidate] = []
         self.null_scores: list[float] = list(known)
         self._null_is_known = null_scores is not None
+        self._patterns = sensor_patterns or SensorPatterns(self.settings)
         self._on_pair = on_pair
         self._adding = Lock()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Patterns fixed to the sensor that were found, in words."""
+        return self._patterns.warnings
 
     def __repr__(self) -> str:
         return f"LoopDetector({len(self.entries)} submaps, {len(self.loops)} loops)"
@@ -151,16 +162,28 @@ class LoopDetector:
         # A mission may never end: its k-th query, which finds k stored, may spend 1 / (k (k + 1)) of
         # `max_false_loops`, all queries together 1.
         pairs = self.expected_pairs or len(stored) ** 2 * (len(stored) + 1)
-        candidates = compare_many(query, stored, self.settings, pairs=pairs, workers=self.workers)
         if self.settings.match.decision == "evidence":
-            null = self._null_with(query, stored)
-            candidates = [by_mission_null(c, null, self.settings, pairs) for c in candidates]
+            candidates = self._by_evidence(query, stored, pairs)
+        else:
+            candidates = compare_many(query, stored, self.settings, pairs=pairs, workers=self.workers)
         self.entries[query.id] = query
         for candidate in candidates:
             self._on_pair(candidate)
         loops = [candidate for candidate in candidates if candidate]
         self.loops += loops
         return loops
+
+    def _by_evidence(
+        self, query: MapEntry, stored: Sequence[MapEntry], pairs: float
+    ) -> list[LoopCandidate]:
+        """Compare without the patterns of the sensor, and decide by the null of the mission."""
+        patterns = self._patterns
+        patterns.add(query)
+        source, targets = patterns.cleaned(query), [patterns.cleaned(entry) for entry in stored]
+        candidates = compare_many(source, targets, self.settings, pairs=pairs, workers=self.workers)
+        null = self._null_with(source, targets)
+        candidates = [by_mission_null(c, null, self.settings, pairs) for c in candidates]
+        return [patterns.judge(c, query, target) for c, target in zip(candidates, stored, strict=True)]
 
     def _null_with(self, query: MapEntry, stored: Sequence[MapEntry]) -> MissionNull:
         """The null of the mission so far; a query adds to it while it is not well known."""
