@@ -173,9 +173,7 @@ class LoopDetector:
         self.loops += loops
         return loops
 
-    def _by_evidence(
-        self, query: MapEntry, stored: Sequence[MapEntry], pairs: float
-    ) -> list[LoopCandidate]:
+    def _by_evidence(self, query: MapEntry, stored: Sequence[MapEntry], pairs: float) -> list[LoopCandidate]:
         """Compare without the patterns of the sensor, and decide by the null of the mission."""
         patterns = self._patterns
         patterns.add(query)

@@ -165,7 +165,10 @@ def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -
             logger.warning("%s", words)
         run = replace(run, warnings=patterns.warnings)
         scores = sample_null(
-            [patterns.cleaned(entry) for entry in entries], run.settings, workers=workers, on_progress=partial(on_progress, "mirror images")
+            [patterns.cleaned(entry) for entry in entries],
+            run.settings,
+            workers=workers,
+            on_progress=partial(on_progress, "mirror images"),
         )
         if scores:
             null = MissionNull.of(scores, run.settings.calibration)

@@ -17,7 +17,7 @@ import numpy as np
 
 from terrainloop.config import Settings
 from terrainloop.entry import MapEntry
-from terrainloop.geometry import Array, se2, yaw_of
+from terrainloop.geometry import Array, inverse, se2, yaw_of
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.overlay import agreement_at
@@ -155,7 +155,8 @@ class SensorPatterns:
         energies = np.array([self._submaps[entry.id].energy for entry in members])
         session.stack, session.pattern = None, None
         if len(members) > MIN_SUBMAPS:
-            stack = _Stack.of(members, 1.0 / np.maximum(energies, max(np.quantile(energies, SMOOTHEST), 1e-30)))
+            least = max(float(np.quantile(energies, SMOOTHEST)), 1e-30)
+            stack = _Stack.of(members, 1.0 / np.maximum(energies, least))
             session.pattern = stack and stack.pattern()
         if session.pattern is not None:
             session.stack = stack
@@ -164,8 +165,8 @@ class SensorPatterns:
 
     def _clean(self, session: "_Session", ids: Sequence[str]) -> None:
         for name in ids:
-            submap = self._submaps[name]
-            entry = submap.entry if session.stack is None else session.stack.clean(submap.entry, self.settings)
+            submap, stack = self._submaps[name], session.stack
+            entry = submap.entry if stack is None else stack.clean(submap.entry, self.settings)
             removed = session.pattern if entry is not submap.entry else None
             self._submaps[name] = replace(submap, cleaned=entry, removed=removed)
 
@@ -185,7 +186,19 @@ class SensorPatterns:
                 supporting, count = supporting + weight, count + 1
         if count >= MIN_SUPPORTERS and supporting >= EXPLAINED * total:
             return f"a pattern fixed to the sensor explains it, {count} other submaps agree at this pose too"
+        if total - supporting < MIN_SUBMAPS and self._at_identity(candidate, source.entry, target.entry):
+            return "a pattern fixed to the sensor may explain it, too few other submaps tell"
         return ""
+
+    def _at_identity(self, candidate: LoopCandidate, source: MapEntry, target: MapEntry) -> bool:
+        """Whether the sensor sees a pair at one place of its frame, which odometry does not confirm."""
+        tolerance = self.settings.calibration.min_separation * source.field.length_scale
+        T, poses = candidate.T_target_source, [target.record.odometry, source.record.odometry]
+        if candidate.overlap < MIN_COVER or np.hypot(*T[:2, 3]) > tolerance or _is_far(source.gradient_map):
+            return False
+        if poses[0] is None or poses[1] is None:
+            return True
+        return bool(np.hypot(*(inverse(poses[0]) @ poses[1] - T)[:2, 3]) > tolerance)
 
     def _others(self, source: MapEntry, target: MapEntry) -> "list[_Submap]":
         """Up to `MAX_OTHERS` submaps that, as far as odometry says, show neither place."""
@@ -245,8 +258,7 @@ class _Stack:
         ends = np.array([_corner(m, origin, resolution) + m.mask.shape for m in maps])
         extent = ends.max(axis=0)
         most = MAX_PIXELS * max(m.mask.size for m in maps)
-        far = any(m.local_origin.any() for m in maps)
-        if far or any(m.resolution != resolution for m in maps) or extent.astype(float).prod() > most:
+        if any(_is_far(m) or m.resolution != resolution for m in maps) or extent.astype(float).prod() > most:
             return None
         sums = np.zeros((9, *extent))
         for m, weight in zip(maps, weights, strict=True):
@@ -271,9 +283,9 @@ class _Stack:
         return SensorPattern(excess / energy, len(self.members))
 
     def clean(self, entry: MapEntry, settings: Settings) -> MapEntry:
-        """The entry less the mean of the others, shrunk by how much of it chance explains around each pixel."""
+        """The entry less the mean of the others, shrunk by how much of it chance explains nearby."""
         g = entry.gradient_map
-        if g.resolution != self.resolution or g.local_origin.any():
+        if g.resolution != self.resolution or _is_far(g):
             return entry
         _, weight_of_entry = self.members.get(entry.id, (None, 0.0))
         sums = self._at(g)
@@ -373,6 +385,11 @@ def _near(a: MapEntry, b: MapEntry) -> bool:
     if a.record.odometry is None or b.record.odometry is None:
         return False
     return bool(np.hypot(*(a.record.odometry - b.record.odometry)[:2, 3]) < a.field.radius)
+
+
+def _is_far(g: GradientMap) -> bool:
+    """Whether the frame of a map cannot be that of a sensor, which is near what it sees."""
+    return bool(g.local_origin.any())
 
 
 def _support(T: Array, source: MapEntry, other: MapEntry, target: MapEntry) -> float:
