@@ -20,7 +20,7 @@ from terrainloop.entry import MapEntry
 from terrainloop.geometry import Array, inverse, se2, yaw_of
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
-from terrainloop.matching.overlay import agreement_at
+from terrainloop.matching.overlay import Agreement, agreement_at
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ PERIOD = 40  # submaps after which a pattern is measured anew
 MIN_SUPPORT = 0.4  # of the correlation of a loop, at which another submap agrees with both of its submaps too
 MIN_SUPPORTERS = 2  # submaps that have to
 EXPLAINED = 0.3  # share of the other submaps that agree with both, at which a pattern explains a loop
-MAX_OTHERS = 40  # submaps that a loop is held against
+MAX_OTHERS = 20  # submaps that a loop is held against
 MAX_PAIRS = 300  # that the median is taken of
 
 
@@ -176,13 +176,14 @@ class SensorPatterns:
             return ""
         T = candidate.T_target_source
         pose = se2(T[0, 3], T[1, 3], yaw_of(T))
+        agreement = agreement_at(source.cleaned.field, target.cleaned.field, pose)
         energy = max(source.energy, target.energy)
         total, supporting, count = 0.0, 0.0, 0
         for other in self._others(source.entry, target.entry):
             # On rough ground a pattern disappears: such submaps can neither show nor refute it.
             weight = min(1.0, energy / max(other.energy, 1e-30))
             total += weight
-            if _support(pose, source.cleaned, other.cleaned, target.cleaned) > MIN_SUPPORT:
+            if _supports(pose, source.cleaned, other.cleaned, target.cleaned, agreement):
                 supporting, count = supporting + weight, count + 1
         if count >= MIN_SUPPORTERS and supporting >= EXPLAINED * total:
             return f"a pattern fixed to the sensor explains it, {count} other submaps agree at this pose too"
@@ -207,7 +208,8 @@ class SensorPatterns:
             for submap in self._submaps.values()
             if not any(submap.entry.id == e.id or _near(submap.entry, e) for e in (source, target))
         ]
-        return others[:: -(-len(others) // MAX_OTHERS)] if others else []
+        some = np.random.default_rng(self.settings.seed).permutation(len(others))[:MAX_OTHERS]
+        return [others[index] for index in some]
 
 
 @dataclass(frozen=True, eq=False)
@@ -392,10 +394,11 @@ def _is_far(g: GradientMap) -> bool:
     return bool(g.local_origin.any())
 
 
-def _support(T: Array, source: MapEntry, other: MapEntry, target: MapEntry) -> float:
-    """How well another submap agrees with both of a pair at its pose, in units of how well these agree."""
-    pair = agreement_at(source.field, target.field, T)
-    both = agreement_at(source.field, other.field, T), agreement_at(other.field, target.field, T)
-    if pair.correlation <= 0 or min(agreement.area for agreement in both) < 0.5 * pair.area:
-        return 0.0
-    return min(agreement.correlation for agreement in both) / pair.correlation
+def _supports(T: Array, source: MapEntry, other: MapEntry, target: MapEntry, pair: Agreement) -> bool:
+    """Whether another submap agrees with both of a pair at its pose, nearly as well as these agree."""
+
+    def agrees(a: MapEntry, b: MapEntry) -> bool:
+        found = agreement_at(a.field, b.field, T)
+        return found.area >= 0.5 * pair.area and found.correlation > MIN_SUPPORT * pair.correlation
+
+    return agrees(source, other) and agrees(other, target)
