@@ -32,6 +32,7 @@ WINDOW = 2.0  # length scales over which the significance of the mean is average
 MAX_PIXELS = 4  # times the largest map, that frames laid over each other may take
 SMOOTHEST = 0.25  # of the submaps, which weigh the same; rougher ones weigh less
 TYPICAL = 0.5  # of the share, that the median pair has in common: less, and it is ground that some share
+PRESENT = 0.5  # of the pattern, that a submap must have: with less it is of another sensor
 PERIOD = 40  # submaps after which a pattern is measured anew
 MIN_SUPPORT = 0.4  # of the correlation of a loop, at which another submap agrees with both of its submaps too
 MIN_SUPPORTERS = 2  # submaps that have to
@@ -157,7 +158,7 @@ class SensorPatterns:
         if len(members) > MIN_SUBMAPS:
             least = max(float(np.quantile(energies, SMOOTHEST)), 1e-30)
             stack = _Stack.of(members, 1.0 / np.maximum(energies, least))
-            session.pattern = stack and stack.pattern()
+            session.pattern = None if stack is None else stack.pattern()
         if session.pattern is not None:
             session.stack = stack
             session.strongest = max(filter(None, [session.strongest, session.pattern]), key=lambda p: p.share)
@@ -176,18 +177,22 @@ class SensorPatterns:
             return ""
         T = candidate.T_target_source
         pose = se2(T[0, 3], T[1, 3], yaw_of(T))
-        agreement = agreement_at(source.cleaned.field, target.cleaned.field, pose)
+        agreement = agreement_at(source.entry.field, target.entry.field, pose)
         energy = max(source.energy, target.energy)
         total, supporting, count = 0.0, 0.0, 0
         for other in self._others(source.entry, target.entry):
             # On rough ground a pattern disappears: such submaps can neither show nor refute it.
             weight = min(1.0, energy / max(other.energy, 1e-30))
             total += weight
-            if _supports(pose, source.cleaned, other.cleaned, target.cleaned, agreement):
+            if _supports(pose, source.entry, other.entry, target.entry, agreement):
                 supporting, count = supporting + weight, count + 1
         if count >= MIN_SUPPORTERS and supporting >= EXPLAINED * total:
             return f"a pattern fixed to the sensor explains it, {count} other submaps agree at this pose too"
-        if total - supporting < MIN_SUBMAPS and self._at_identity(candidate, source.entry, target.entry):
+        if not self._at_identity(candidate, source.entry, target.entry):
+            return ""
+        if any(session.strongest is not None for session in self._sessions.values()):
+            return "a pattern fixed to the sensor explains it, the frames of both agree as they are"
+        if total - supporting < MIN_SUBMAPS:
             return "a pattern fixed to the sensor may explain it, too few other submaps tell"
         return ""
 
@@ -285,7 +290,10 @@ class _Stack:
         return SensorPattern(excess / energy, len(self.members))
 
     def clean(self, entry: MapEntry, settings: Settings) -> MapEntry:
-        """The entry less the mean of the others, shrunk by how much of it chance explains nearby."""
+        """The entry less the mean of the others, shrunk by how much of it chance explains nearby.
+
+        As it is where it has no such pattern: a mission may have several sensors.
+        """
         g = entry.gradient_map
         if g.resolution != self.resolution or _is_far(g):
             return entry
@@ -301,9 +309,12 @@ class _Stack:
             for image in ((mean**2).sum(axis=0), by_chance)
         )
         weight = valid * np.clip(1.0 - chance / np.maximum(square, 1e-30), 0.0, 1.0)
+        of_sensor = weight * mean * g.mask
+        if (_centred(g) * of_sensor).sum() <= PRESENT * (of_sensor**2).sum():
+            return entry
         x, y = (
-            (image - weight * of_sensor).astype(np.float32)
-            for image, of_sensor in zip((g.gradient_x, g.gradient_y), mean, strict=True)
+            (image - part).astype(np.float32)
+            for image, part in zip((g.gradient_x, g.gradient_y), weight * mean, strict=True)
         )
         return MapEntry.of(entry.record, replace(g, gradient_x=x, gradient_y=y), settings)
 
