@@ -201,7 +201,7 @@ def test_a_rover_that_stands_still_sees_its_ground_in_common():
     still = at_poses(same, np.random.default_rng(0).normal(0, 0.1, (COUNT, 2)))
     assert cleaned(still)[1] == ()
     driving = at_poses(same, np.c_[10.0 * np.arange(COUNT), np.zeros(COUNT)])
-    assert "if the vehicle stood still, give its odometry" in cleaned(driving)[1][0]
+    assert "loops of a vehicle that stood still need its odometry" in cleaned(driving)[1][0]
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05])

@@ -68,8 +68,8 @@ class SensorPattern:
     def __str__(self) -> str:
         return (
             f"a pattern fixed to the sensor makes up {self._size}; it was subtracted before matching: "
-            "calibrate the sensor, or mask what it sees of the vehicle; if the vehicle stood still, "
-            "give its odometry"
+            "calibrate the sensor, or mask what it sees of the vehicle; loops of a vehicle that stood still "
+            "need its odometry"
         )
 
 
