@@ -279,6 +279,28 @@ def test_loops_that_a_pattern_may_explain_wait_for_other_submaps():
     assert explained(elsewhere) == (False, True)
 
 
+def test_where_a_pattern_was_found_the_identity_needs_odometry(biased):
+    again = entry_of(3, 0.03, noise=0.02, index=10)
+    pairs, _ = online([*biased, again])
+    assert ("10", "3") not in {(pair.source, pair.target) for pair in pairs if pair}
+    (pair,) = (pair for pair in pairs if (pair.source, pair.target) == ("10", "3"))
+    assert pair.reason.startswith("a pattern fixed to the sensor explains it")
+    assert np.isnan(pair.covariance).all()
+    positions = np.c_[10.0 * np.arange(11), np.zeros(11)]
+    positions[-1] = positions[3]
+    pairs, _ = online(at_poses([*biased, again], positions))
+    assert ("10", "3") in {(pair.source, pair.target) for pair in pairs if pair}
+
+
+def test_another_sensor_is_not_trusted_at_the_identity_after_a_pattern_was_found():
+    first = [entry_of(seed, 0.03, noise=0.02, relief=0.1) for seed in range(8)]
+    second = [entry_of(seed, 0.03, noise=0.02, relief=0.1, sensor=1) for seed in (8, 9)]
+    pairs, _ = online([*first, *second])
+    assert not any(pairs)
+    assert "explains it, the two agree in the frame of the sensor" in pairs[-1].reason
+    assert "was subtracted" not in pairs[-1].reason
+
+
 def test_other_submaps_refute_a_pattern():
     places = [entry_of(seed, noise=0.02, index=seed) for seed in range(6)]
     pairs, _ = online([*places, entry_of(0, noise=0.02, index=6)])

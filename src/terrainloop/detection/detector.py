@@ -94,6 +94,9 @@ class LoopDetector:
             expected_pairs is None or _is_count(expected_pairs), "expected_pairs of 0 or more", expected_pairs
         )
         _require(all(map(_is_finite, known)), "finite null_scores", known)
+        _require(
+            isinstance(sensor_patterns, SensorPatterns | None), "SensorPatterns or None", sensor_patterns
+        )
         _require(callable(on_pair), "a function on_pair", on_pair)
         self.parameters = parameters
         self.expected_pairs = expected_pairs

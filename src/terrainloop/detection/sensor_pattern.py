@@ -10,7 +10,7 @@ agree too is that of a pattern.
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, islice
 
 import cv2
 import numpy as np
@@ -173,9 +173,10 @@ class SensorPatterns:
 
     def _objection(self, candidate: LoopCandidate, source: "_Submap", target: "_Submap") -> str:
         """Why a loop is none, in words: submaps of other places agree with both at its pose as well."""
-        if _same_cloud(source.entry, target.entry):
-            return ""
         T = candidate.T_target_source
+        near = self.settings.calibration.min_separation * source.entry.field.length_scale
+        if _same_cloud(source.entry, target.entry) or _as_by_odometry(T, source.entry, target.entry, near):
+            return ""
         pose = se2(T[0, 3], T[1, 3], yaw_of(T))
         agreement = agreement_at(source.entry.field, target.entry.field, pose)
         energy = max(source.energy, target.energy)
@@ -188,33 +189,27 @@ class SensorPatterns:
                 supporting, count = supporting + weight, count + 1
         if count >= MIN_SUPPORTERS and supporting >= EXPLAINED * total:
             return f"a pattern fixed to the sensor explains it, {count} other submaps agree at this pose too"
-        if not self._at_identity(candidate, source.entry, target.entry):
+        at_identity = candidate.overlap >= MIN_COVER and np.hypot(*T[:2, 3]) <= near
+        if not at_identity or _is_far(source.entry.gradient_map):
             return ""
         if any(session.strongest is not None for session in self._sessions.values()):
-            return "a pattern fixed to the sensor explains it, the frames of both agree as they are"
+            return "a pattern fixed to the sensor explains it, the two agree in the frame of the sensor"
         if total - supporting < MIN_SUBMAPS:
             return "a pattern fixed to the sensor may explain it, too few other submaps tell"
         return ""
 
-    def _at_identity(self, candidate: LoopCandidate, source: MapEntry, target: MapEntry) -> bool:
-        """Whether the sensor sees a pair at one place of its frame, which odometry does not confirm."""
-        tolerance = self.settings.calibration.min_separation * source.field.length_scale
-        T, poses = candidate.T_target_source, [target.record.odometry, source.record.odometry]
-        if candidate.overlap < MIN_COVER or np.hypot(*T[:2, 3]) > tolerance or _is_far(source.gradient_map):
-            return False
-        if poses[0] is None or poses[1] is None:
-            return True
-        return bool(np.hypot(*(inverse(poses[0]) @ poses[1] - T)[:2, 3]) > tolerance)
-
     def _others(self, source: MapEntry, target: MapEntry) -> "list[_Submap]":
         """Up to `MAX_OTHERS` submaps that, as far as odometry says, show neither place."""
-        others = [
-            submap
-            for submap in self._submaps.values()
-            if not any(submap.entry.id == e.id or _near(submap.entry, e) for e in (source, target))
-        ]
-        some = np.random.default_rng(self.settings.seed).permutation(len(others))[:MAX_OTHERS]
-        return [others[index] for index in some]
+        submaps = list(self._submaps.values())
+        shuffled = np.random.default_rng(self.settings.seed).permutation(len(submaps))
+        elsewhere = (
+            submaps[index]
+            for index in shuffled
+            if not any(
+                submaps[index].entry.id == e.id or _near(submaps[index].entry, e) for e in (source, target)
+            )
+        )
+        return list(islice(elsewhere, MAX_OTHERS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -403,6 +398,14 @@ def _near(a: MapEntry, b: MapEntry) -> bool:
 def _is_far(g: GradientMap) -> bool:
     """Whether the frame of a map cannot be that of a sensor, which is near what it sees."""
     return bool(g.local_origin.any())
+
+
+def _as_by_odometry(T: Array, source: MapEntry, target: MapEntry, tolerance: float) -> bool:
+    """Whether odometry puts the source where T does, to a tolerance in metres."""
+    to_world, from_source = target.record.odometry, source.record.odometry
+    if to_world is None or from_source is None:
+        return False
+    return bool(np.hypot(*(inverse(to_world) @ from_source - T)[:2, 3]) < tolerance)
 
 
 def _supports(T: Array, source: MapEntry, other: MapEntry, target: MapEntry, pair: Agreement) -> bool:
