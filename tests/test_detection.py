@@ -300,11 +300,12 @@ def test_what_is_no_settings_is_refused(settings):
         ("expected_pairs", 2.5),
         ("null_scores", [1.0, np.nan]),
         ("null_scores", "abc"),
+        ("sensor_patterns", []),
         ("on_pair", 3),
     ],
 )
 def test_impossible_arguments_are_refused(name, value):
-    expected = "Hyperparameters" if name == "parameters" else name
+    expected = {"parameters": "Hyperparameters", "sensor_patterns": "SensorPatterns"}.get(name, name)
     with pytest.raises(TerrainLoopError, match=f"expected.*{expected}"):
         LoopDetector(**{name: value})
 

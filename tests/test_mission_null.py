@@ -30,7 +30,7 @@ def mounds(seed):
     """Three mounds in much the same triangle on smooth ground: unrelated places look alike."""
     rng = np.random.default_rng(seed)
     triangle = np.array([[-0.9, -0.5], [0.9, -0.5], [0.4, 0.9]]) + rng.normal(0, 0.12, (3, 2))
-    centres = transform(se2(*rng.uniform(-0.3, 0.3, 2), rng.uniform(0, 2 * np.pi)), triangle)
+    centres = transform(se2(*rng.uniform(-0.8, 0.8, 2), rng.uniform(0, 2 * np.pi)), triangle)
     ripple = rng.uniform(0, 2 * np.pi, (12, 2))
 
     def ground(xy):

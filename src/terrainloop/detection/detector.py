@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from terrainloop.config import Settings
 from terrainloop.detection.allowance import pairs_equivalent, plausible_by_odometry, share_of_query
+from terrainloop.detection.sensor_pattern import SensorPatterns
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import Array
@@ -51,6 +52,9 @@ class LoopDetector:
         Otherwise later queries are given less of it, so that it holds for any number (see `allowance`).
     null_scores : sequence of float, optional
         Scores of mirror images, where they are known (see `sample_null`); else measured on the way.
+    sensor_patterns : SensorPatterns, optional
+        Of the submaps that will be added, where these are known; else patterns fixed to the sensor are
+        measured on the way.
     on_pair : callable, optional
         Called with every LoopCandidate as it is decided, rejected ones too; the detector keeps the loops
         only.
@@ -82,6 +86,7 @@ class LoopDetector:
         parameters: Hyperparameters | None = None,
         expected_pairs: int | None = None,
         null_scores: Sequence[float] | None = None,
+        sensor_patterns: SensorPatterns | None = None,
         on_pair: PairSink = lambda candidate: None,
         workers: int = 1,
     ) -> None:
@@ -92,6 +97,9 @@ class LoopDetector:
             expected_pairs is None or _is_count(expected_pairs), "expected_pairs of 0 or more", expected_pairs
         )
         _require(all(map(_is_finite, known)), "finite null_scores", known)
+        _require(
+            isinstance(sensor_patterns, SensorPatterns | None), "SensorPatterns or None", sensor_patterns
+        )
         _require(callable(on_pair), "a function on_pair", on_pair)
         self.parameters = parameters
         self.expected_pairs = expected_pairs
@@ -100,8 +108,14 @@ class LoopDetector:
         self.loops: list[LoopCandidate] = []
         self.null_scores: list[float] = list(known)
         self._null_is_known = null_scores is not None
+        self._patterns = sensor_patterns or SensorPatterns(self.settings)
         self._on_pair = on_pair
         self._adding = Lock()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Patterns fixed to the sensor that were found, in words."""
+        return self._patterns.warnings
 
     def __repr__(self) -> str:
         return f"LoopDetector({len(self.entries)} submaps, {len(self.loops)} loops)"
@@ -160,19 +174,30 @@ class LoopDetector:
         known = self.expected_pairs
         share = len(stored) / known if known else share_of_query(max(len(stored), 1))
         pairs = pairs_equivalent(share, plausible)
-        candidates = compare_many(query, stored, self.settings, pairs=pairs, workers=self.workers)
         if self.settings.match.decision == "evidence":
-            null = self._null_with(query, stored, plausible)
-            candidates = [
-                by_mission_null(candidate, null, self.settings, among)
-                for candidate, among in zip(candidates, pairs, strict=True)
-            ]
+            candidates = self._by_evidence(query, stored, plausible, pairs)
+        else:
+            candidates = compare_many(query, stored, self.settings, pairs=pairs, workers=self.workers)
         self.entries[query.id] = query
         for candidate in candidates:
             self._on_pair(candidate)
         loops = [candidate for candidate in candidates if candidate]
         self.loops += loops
         return loops
+
+    def _by_evidence(
+        self, query: MapEntry, stored: Sequence[MapEntry], plausible: NDArray[np.bool_], pairs: Array
+    ) -> list[LoopCandidate]:
+        """Compare without the patterns of the sensor, and decide by the null of the mission."""
+        patterns = self._patterns
+        patterns.add(query)
+        source, targets = patterns.cleaned(query), [patterns.cleaned(entry) for entry in stored]
+        candidates = compare_many(source, targets, self.settings, pairs=pairs, workers=self.workers)
+        null = self._null_with(source, targets, plausible)
+        return [
+            patterns.judge(by_mission_null(candidate, null, self.settings, among), query, target)
+            for candidate, among, target in zip(candidates, pairs, stored, strict=True)
+        ]
 
     def _null_with(
         self, query: MapEntry, stored: Sequence[MapEntry], plausible: NDArray[np.bool_]

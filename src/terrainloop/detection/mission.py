@@ -20,7 +20,7 @@ from terrainloop.detection.detector import (
     sample_null,
 )
 from terrainloop.detection.run import Run, RunWriter, Tally
-from terrainloop.detection.sensor_pattern import remove_sensor_pattern
+from terrainloop.detection.sensor_pattern import SensorPatterns
 from terrainloop.detection.workers import map_in_processes
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError, printable
@@ -158,14 +158,17 @@ def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -
         on_pair(candidate)
 
     compared = max(0, len(run.entries) - run.settings.skip_recent)
-    entries, scores = list(run.entries.values()), []
+    entries, patterns, scores = list(run.entries.values()), None, []
     if run.settings.match.decision == "evidence":
-        entries, pattern = remove_sensor_pattern(entries, run.settings)
-        if pattern is not None:
-            logger.warning("%s", pattern)
-            run = replace(run, warnings=(str(pattern),))
+        patterns = SensorPatterns(run.settings, entries)
+        for words in patterns.warnings:
+            logger.warning("%s", words)
+        run = replace(run, warnings=patterns.warnings)
         scores = sample_null(
-            entries, run.settings, workers=workers, on_progress=partial(on_progress, "mirror images")
+            [patterns.cleaned(entry) for entry in entries],
+            run.settings,
+            workers=workers,
+            on_progress=partial(on_progress, "mirror images"),
         )
         if scores:
             null = MissionNull.of(scores, run.settings.calibration)
@@ -175,6 +178,7 @@ def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -
         parameters=run.parameters,
         expected_pairs=compared * (compared - 1) // 2,
         null_scores=scores,
+        sensor_patterns=patterns,
         on_pair=count,
         workers=workers,
     )
