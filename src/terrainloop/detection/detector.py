@@ -18,6 +18,7 @@ from terrainloop.gp.training import TrainingData, detrend
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.mission_null import MissionNull, by_mission_null, mirrored
+from terrainloop.matching.mission_warp import with_mission_warp
 from terrainloop.matching.register import compare_many
 from terrainloop.record import SubmapRecord
 from terrainloop.resources import check_memory, memory_errors
@@ -155,6 +156,7 @@ class LoopDetector:
         if self.settings.match.decision == "evidence":
             null = self._null_with(query, stored)
             candidates = [by_mission_null(c, null, self.settings, pairs) for c in candidates]
+            candidates = with_mission_warp(candidates, self.settings.calibration, earlier=self.loops)
         self.entries[query.id] = query
         for candidate in candidates:
             self._on_pair(candidate)

@@ -104,5 +104,6 @@ def by_mission_null(
         score=candidate.score if candidate.score == NO_EVIDENCE else -log_nfa,
         accepted=candidate.accepted and not explained,
         covariance=np.full((6, 6), np.nan) if explained else candidate.covariance,
+        warp=None if explained else candidate.warp,
         reason=reason_in_words(objection, log_nfa + np.log10(pairs), allowed, fit),
     )
