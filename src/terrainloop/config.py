@@ -174,19 +174,19 @@ class Calibration(_Frozen):
     # Covariance (section 4)
     block: float = Field(2.0, gt=0, description="side of the independent blocks of ground, length scales")
     noise_factor: float = Field(
-        3.0, gt=0, description="variance of a pose by noise, over that of independent blocks"
+        2.5, gt=0, description="variance of a pose by noise, over that of independent blocks"
     )
     warp_noise_factor: float = Field(5.0, gt=0, description="the same of a warp")
     usual_warp: float = Field(0.0009, gt=0, description="standard deviation of a submap's warp, a priori")
-    usual_warp_samples: float = Field(2.0, gt=0, description="number of samples that this prior is worth")
+    usual_warp_samples: float = Field(1.0, gt=0, description="number of samples that this prior is worth")
     reach_of_radius: float = Field(
         2.8, ge=0, description="squared reach per squared radius of the shared ground"
     )
     motion_by_warp: _Triple = Field(
-        (55.0, 55.0, 24.0), description="variance of x, y, z per squared metre of reach, per warp variance"
+        (66.0, 66.0, 29.0), description="variance of x, y, z per squared metre of reach, per warp variance"
     )
     rotation_by_warp: _Triple = Field(
-        (36.0, 36.0, 320.0), description="variance of roll, pitch, yaw per warp variance"
+        (43.0, 43.0, 380.0), description="variance of roll, pitch, yaw per warp variance"
     )
 
 

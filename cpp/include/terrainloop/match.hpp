@@ -37,13 +37,13 @@ struct Calibration {
   double ambiguity_chance = 0.01;  ///< NFA above which a rival is left to chance
   // Covariance
   double block = 2.0;               ///< side of the independent blocks of ground, length scales
-  double noise_factor = 3.0;        ///< variance of a pose by noise, over that of independent blocks
+  double noise_factor = 2.5;        ///< variance of a pose by noise, over that of independent blocks
   double warp_noise_factor = 5.0;   ///< the same of a warp
   double usual_warp = 0.0009;       ///< standard deviation of a submap's warp, a priori
-  double usual_warp_samples = 2.0;  ///< samples that this prior is worth
+  double usual_warp_samples = 1.0;  ///< samples that this prior is worth
   double reach_of_radius = 2.8;     ///< squared reach per squared radius of the shared ground
-  std::array<double, 3> motion_by_warp = {55.0, 55.0, 24.0};     ///< variance of x, y, z per m^2 of reach
-  std::array<double, 3> rotation_by_warp = {36.0, 36.0, 320.0};  ///< variance of roll, pitch, yaw
+  std::array<double, 3> motion_by_warp = {66.0, 66.0, 29.0};     ///< variance of x, y, z per m^2 of reach
+  std::array<double, 3> rotation_by_warp = {43.0, 43.0, 380.0};  ///< variance of roll, pitch, yaw
 };
 
 struct MatchSettings {

@@ -111,8 +111,8 @@ double warp_variance(const Eigen::Array3d& squares, const Eigen::Array3d& noise,
   double variance = usual;
   for (int step = 0; step < kSteps; ++step) {
     const Eigen::Array3d weights = (1.0 + noise / std::max(variance, usual)).square().inverse();
-    const double excess = (weights * (squares - noise)).sum();
-    variance = std::max(prior * usual + excess, 0.0) / (prior + weights.sum());
+    const double excess = std::max((weights * (squares - noise)).sum(), 0.0);
+    variance = (prior * usual + excess) / (prior + weights.sum());
   }
   return variance;
 }

@@ -19,9 +19,9 @@ STEPS = 10  # in which the weights of the samples settle
 def warp_variance(warps: Iterable[Warp], calibration: Calibration) -> float:
     """Variance of the warp of one submap, dimensionless; of the usual one where nothing is known.
 
-    The mean of the samples less their noise and of a prior that is worth a few of them. A sample counts less
-    the noisier it is, as the inverse of its variance about a warp of the size found, or of the usual one if
-    that is larger.
+    The mean of the samples less their noise, together no less than zero, and of a prior that is worth a few
+    of them. A sample counts less the noisier it is: as the inverse of its variance about a warp of the size
+    found, or of the usual one if that is larger.
     """
     usual, prior = calibration.usual_warp**2, calibration.usual_warp_samples
     squares, noise = np.array([(w.squares, w.noise) for w in warps]).reshape(-1, 2, 3).swapaxes(0, 1)
@@ -30,7 +30,7 @@ def warp_variance(warps: Iterable[Warp], calibration: Calibration) -> float:
     variance = usual
     for _ in range(STEPS):
         weights = (1.0 + noise / max(variance, usual)) ** -2.0
-        variance = max(prior * usual + float(weights @ excess), 0.0) / (prior + float(weights.sum()))
+        variance = (prior * usual + max(float(weights @ excess), 0.0)) / (prior + float(weights.sum()))
     return variance
 
 
