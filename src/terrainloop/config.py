@@ -183,10 +183,10 @@ class Calibration(_Frozen):
         2.8, ge=0, description="squared reach per squared radius of the shared ground"
     )
     motion_by_warp: _Triple = Field(
-        (66.0, 66.0, 29.0), description="variance of x, y, z per squared metre of reach, per warp variance"
+        (60.0, 60.0, 26.0), description="variance of x, y, z per squared metre of reach, per warp variance"
     )
     rotation_by_warp: _Triple = Field(
-        (43.0, 43.0, 380.0), description="variance of roll, pitch, yaw per warp variance"
+        (40.0, 40.0, 350.0), description="variance of roll, pitch, yaw per warp variance"
     )
 
 

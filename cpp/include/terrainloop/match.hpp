@@ -42,8 +42,8 @@ struct Calibration {
   double usual_warp = 0.0009;       ///< standard deviation of a submap's warp, a priori
   double usual_warp_samples = 1.0;  ///< samples that this prior is worth
   double reach_of_radius = 2.8;     ///< squared reach per squared radius of the shared ground
-  std::array<double, 3> motion_by_warp = {66.0, 66.0, 29.0};     ///< variance of x, y, z per m^2 of reach
-  std::array<double, 3> rotation_by_warp = {43.0, 43.0, 380.0};  ///< variance of roll, pitch, yaw
+  std::array<double, 3> motion_by_warp = {60.0, 60.0, 26.0};     ///< variance of x, y, z per m^2 of reach
+  std::array<double, 3> rotation_by_warp = {40.0, 40.0, 350.0};  ///< variance of roll, pitch, yaw
 };
 
 struct MatchSettings {

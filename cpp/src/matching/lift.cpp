@@ -50,11 +50,13 @@ struct Ground {
   /// Root mean square distance from the pivot.
   double radius() const { return std::sqrt(positions.squaredNorm() / static_cast<double>(positions.rows())); }
 
-  /// The design and the second-degree part, which is at right angles to it where the ground is even.
+  /// The design and, as rises over the radius, the second-degree parts.
   MatrixXd bent_design() const {
-    const Eigen::ArrayXd x = positions.col(0).array() / radius(), y = positions.col(1).array() / radius();
+    const double unit = radius();
+    const Eigen::ArrayXd x = positions.col(0).array() / unit, y = positions.col(1).array() / unit;
     MatrixXd columns(positions.rows(), 6);
-    columns << design(), x.square() - y.square(), 2.0 * x * y, x.square() + y.square() - 1.0;
+    columns << design(), unit * (x.square() - y.square()), 2.0 * unit * x * y,
+        unit * (x.square() + y.square() - 1.0);
     return columns;
   }
 
@@ -117,23 +119,21 @@ double warp_variance(const Eigen::Array3d& squares, const Eigen::Array3d& noise,
   return variance;
 }
 
-/// By least squares with outliers rejected once; nothing if undetermined.
+/// By least squares, after outliers from a bent plane were rejected; nothing if undetermined.
 std::optional<Plane> fit_plane(const Ground& ground, const Calibration& calibration, double length_scale) {
   if (ground.difference.size() < kMinPixels) return std::nullopt;
   const double block = calibration.block * length_scale;
-  const MatrixXd design = ground.design();
-  const VectorXd first = (design.transpose() * design)
-                             .completeOrthogonalDecomposition()
-                             .solve(design.transpose() * ground.difference);
-  const Ground kept = ground.of(inliers(ground.difference - design * first));
+  const MatrixXd all = ground.bent_design();
+  const VectorXd first =
+      (all.transpose() * all).completeOrthogonalDecomposition().solve(all.transpose() * ground.difference);
+  const Ground kept = ground.of(inliers(ground.difference - all * first));
   if (kept.difference.size() < kMinPixels) return std::nullopt;
   const MatrixXd columns = kept.design();
   const Fit plane = kept.fit(columns, block), bent = kept.fit(kept.bent_design(), block);
   if (plane.covariance.hasNaN()) return std::nullopt;
   const double radius = kept.radius();
-  const Eigen::Array3d warp = bent.parameters.tail<3>() / radius;
-  const Eigen::Array3d noise =
-      calibration.warp_noise_factor / (radius * radius) * bent.covariance.diagonal().tail<3>();
+  const Eigen::Array3d warp = bent.parameters.tail<3>();
+  const Eigen::Array3d noise = calibration.warp_noise_factor * bent.covariance.diagonal().tail<3>();
   const Matrix3d by_alignment = (columns.transpose() * columns)
                                     .completeOrthogonalDecomposition()
                                     .solve(columns.transpose() * kept.by_alignment());

@@ -106,6 +106,13 @@ class _Ground:
         return np.stack([np.ones_like(x), y, -x], axis=1)
 
     @property
+    def bent_design(self) -> Array:
+        """The design and, as rises over the radius, the second-degree parts (N, 6)."""
+        x, y = self.positions.T / self.radius
+        bent = np.stack([x**2 - y**2, 2 * x * y, x**2 + y**2 - 1], axis=1)
+        return np.concatenate([self.design, self.radius * bent], axis=1)
+
+    @property
     def by_alignment(self) -> Array:
         """Derivative (N, 3) of the elevation difference by (x, y, yaw) of the alignment."""
         (x, y), (slope_x, slope_y) = self.positions.T, self.slope.T
@@ -154,27 +161,25 @@ class _Plane:
 
 
 def _fit_plane(ground: _Ground, calibration: Calibration, length_scale: float) -> _Plane | None:
-    """The plane by least squares with outliers rejected once; None if undetermined."""
+    """The plane by least squares, after outliers from a bent one were rejected; None if undetermined."""
     if len(ground.positions) < MIN_PIXELS:
         return None
-    plane = np.linalg.lstsq(ground.design, ground.difference, rcond=None)[0]
-    residual = ground.difference - ground.design @ plane
+    bent = np.linalg.lstsq(ground.bent_design, ground.difference, rcond=None)[0]
+    residual = ground.difference - ground.bent_design @ bent
     spread = 1.4826 * np.median(np.abs(residual - np.median(residual)))
     kept = ground[np.abs(residual) <= max(OUTLIER * spread, 1e-9)]
     block = calibration.block * length_scale
     plane, covariance = _least_squares(kept, kept.design, block)
     if np.isnan(covariance).any():
         return None
-    x, y = kept.positions.T / kept.radius
-    bent = np.stack([x**2 - y**2, 2 * x * y, x**2 + y**2 - 1], axis=1)
-    warp, noise = _least_squares(kept, np.concatenate([kept.design, bent], axis=1), block)
+    bent, noise = _least_squares(kept, kept.bent_design, block)
     by_alignment = np.linalg.lstsq(kept.design, kept.by_alignment, rcond=None)[0]
     return _Plane(
         parameters=plane,
         covariance=calibration.noise_factor * covariance,
         by_alignment=np.asarray(by_alignment, dtype=float),
-        warp=warp[3:] / kept.radius,
-        warp_noise=calibration.warp_noise_factor * np.diag(noise)[3:] / kept.radius**2,
+        warp=bent[3:],
+        warp_noise=calibration.warp_noise_factor * np.diag(noise)[3:],
         radius=kept.radius,
     )
 
