@@ -195,7 +195,7 @@ def test_no_more_blocks_than_parameters_tell_nothing(blocks):
 
 
 def test_the_pose_errs_no_more_than_its_covariance_says(world, gp_map):
-    """Maps of noisy points, each ground seen twice: sigmas are short by less than 1.9, before strain."""
+    """Maps of noisy points, each ground seen twice, rigid: sigmas are short by less than 1.9."""
     T = se2(0.4, -0.3, 0.7)
     frame = se3(0.4, -0.3, 0.0, 0.0, 0.0, 0.7)
     values = []

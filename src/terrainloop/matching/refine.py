@@ -76,7 +76,7 @@ class Refinement:
         """(3, 3) of (x, y, yaw) about the pivot, metres and radians, if the submaps are rigid.
 
         The information is that of the slopes of Cauchy's influence function, not of its weights, as for every
-        M-estimator (P. J. Huber, Robust Statistics, 1981, section 6.6).
+        M-estimator (P. J. Huber, Robust Statistics, 1981, chapter 7).
         """
         flat = self.motion.reshape(-1, self.motion.shape[-1])
         normal = (flat * self.slopes.reshape(-1, 1)).T @ flat
