@@ -102,7 +102,7 @@ void weigh(Linearised& at, const std::vector<double>& variance) {
   for (std::size_t i = 0; i < 2 * count; ++i) {
     const double kept = 1.0 / (1.0 + std::pow(normalised[i] / half, 2));
     at.weights[i] = kept / variance[i % count];
-    at.slopes[i] = at.weights[i] * (2.0 * kept - 1.0);
+    at.slopes[i] = at.weights[i] * std::max(2.0 * kept - 1.0, 0.0);
   }
 }
 

@@ -53,7 +53,7 @@ class Refinement:
         Sample points in the target frame, metres.
     residual, weights, slopes : array, (2, N)
         Residuals of the two components of the gradient, their weights, and the derivatives of weights times
-        residuals by the residuals.
+        residuals by the residuals; zero where a larger residual counts less.
     motion : array, (2, N, 5)
         Jacobian of the residual by x, y, yaw about the pivot, and the difference in slope along x and y.
     length_scale : float
