@@ -5,6 +5,7 @@
     python benchmarks/matching.py errors MISSION...   errors of accepted loops against their covariance
     python benchmarks/matching.py time MISSION        one query against 14 submaps, by stage
     python benchmarks/matching.py sensors             stereo submaps against LiDAR submaps of one world
+    python benchmarks/matching.py covariance          errors against covariance by drift, sensor and origin
 
 A mission is a folder with clouds and truth.tum ('terrainloop simulate' makes some); passes.csv beside them
 names sessions; only pairs of different sessions are compared. Maps are cached in
@@ -14,10 +15,13 @@ names sessions; only pairs of different sessions are compared. Maps are cached i
 import argparse
 import pickle
 import platform
+import sys
+import tempfile
 import time
 from collections import defaultdict
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import lru_cache
 from itertools import combinations
 from multiprocessing import get_context
@@ -40,18 +44,20 @@ from terrainloop.detection.detector import (
     map_submap,
     sample_null,
 )
-from terrainloop.detection.mission import MissionMapping
+from terrainloop.detection.mission import MissionMapping, detect_mission
 from terrainloop.evaluation.overlap import world_boxes
 from terrainloop.evaluation.pairs import evaluate_pairs
 from terrainloop.evaluation.summary import OVERLAP_BANDS
 from terrainloop.evaluation.truth import GroundTruth
-from terrainloop.geometry import inverse, parameters_of, yaw_of
+from terrainloop.geometry import inverse, parameters_of, se3, transform, yaw_of
+from terrainloop.io.clouds import write_cloud
 from terrainloop.io.missions import load_mission, read_sessions
 from terrainloop.io.trajectories import read_trajectory
 from terrainloop.matching import decision, hypotheses, register
+from terrainloop.matching.mission_warp import with_mission_warp
 from terrainloop.matching.register import compare, compare_many
 from terrainloop.record import SubmapRecord
-from terrainloop.simulation.missions import submap_cloud
+from terrainloop.simulation.missions import submap_cloud, thin
 from terrainloop.simulation.odometry import estimate, true_poses
 from terrainloop.simulation.paths import revisiting_path
 from terrainloop.simulation.setups import SETUPS
@@ -114,7 +120,7 @@ def detected(job):
         )
         for entry in entries:
             detector.add_entry(entry)
-    return pairs
+    return with_mission_warp(pairs, settings.calibration)
 
 
 def judged(folder, candidates):
@@ -232,12 +238,8 @@ def errors(folders, figure):
             for p in good:
                 c = p.candidate
                 truth = inverse(poses[order[c.target]]) @ poses[order[c.source]]
-                error = parameters_of(c.T_target_source) - parameters_of(truth)
-                error[3:] = (error[3:] + np.pi) % (2 * np.pi) - np.pi
-                squares.append(error @ np.linalg.solve(c.covariance, error))
-                for part, values in (([0, 1, 5], plane), ([2, 3, 4], rest)):
-                    block = c.covariance[np.ix_(part, part)]
-                    values.append(error[part] @ np.linalg.solve(block, error[part]))
+                for part, values in ((ALL, squares), (PLANE, plane), (REST, rest)):
+                    values.append(normalised(c, truth, part))
             median = [
                 np.median([getattr(p, name) for p in good])
                 for name in ("position_error", "height_error", "yaw_error")
@@ -263,6 +265,16 @@ def errors(folders, figure):
         axes.set_title(f"{len(together)} accepted loops")
         axes.legend()
         drawing.savefig(figure, dpi=110)
+
+
+ALL, PLANE, REST = [0, 1, 2, 3, 4, 5], [0, 1, 5], [2, 3, 4]
+
+
+def normalised(candidate, truth, part):
+    """Squared error of some of (x, y, z, roll, pitch, yaw), normalised by its covariance."""
+    error = parameters_of(candidate.T_target_source) - parameters_of(truth)
+    error[3:] = (error[3:] + np.pi) % (2 * np.pi) - np.pi
+    return error[part] @ np.linalg.solve(candidate.covariance[np.ix_(part, part)], error[part])
 
 
 def query_time(folders, _):
@@ -362,15 +374,127 @@ def sensors(_, __):
         )
 
 
+DRIVES = (  # sensor, world, seed, submaps; seeds 400-419 were tuned on
+    *(("stereo", world, 420 + k, 16) for k, world in enumerate(2 * ("etna", "mars", "morocco"))),
+    *(("lidar", world, 426 + k, 10) for k, world in enumerate(("etna", "mars"))),
+    *(("survey", world, 428 + k, 24) for k, world in enumerate(("etna", "mars"))),
+)
+ORIGINS = {"first pose": 0, "last pose": -1}  # of the rover in the submap: ground ahead, or all round
+
+
+def covariance(_, __):
+    """Errors of the loops of simulated drives, normalised by their covariances, by drift and origin."""
+    found = defaultdict(list)
+    for sensor, world, seed, submaps in DRIVES:
+        setup = SETUPS[sensor]
+        true, seen, for_odometry = observed(setup, world, seed, submaps)
+        for times in (0, 1, 5) if setup.frames > 1 else (0,):
+            for origin in ORIGINS if setup.frames > 1 else ("first pose",):
+                local, poses = stitched(setup, true, times, ORIGINS[origin], for_odometry)
+                found[sensor, origin, times] += judged_covariances(setup, seen, local, poses)
+                print(f"{sensor} {world} {seed}, origin {origin}, drift {times} x", file=sys.stderr)
+    print("| sensor | origin | drift | loops | NEES / 6 | x, y, yaw / 3 | z, roll, pitch / 3 ", end="")
+    print("| within 95 % | as they were decided: NEES / 6, within 95 % |")
+    print("|---" * 9 + "|")
+    for (sensor, origin, times), rows in found.items():
+        total, plane, rest, online = np.array(rows).T
+        drift = f"{times} x" if times else "rigid"
+        nees = f"{total.mean() / 6:.2f} | {plane.mean() / 3:.2f} | {rest.mean() / 3:.2f}"
+        print(
+            f"| {sensor} | {origin} | {drift} | {len(rows)} | {nees} | {within_95(total):.0%} "
+            f"| {online.mean() / 6:.2f}, {within_95(online):.0%} |"
+        )
+
+
+def within_95(squares):
+    return np.mean(squares < chi2.ppf(0.95, 6))
+
+
+def observed(setup, world, seed, submaps):
+    """True poses of a drive, what the sensor sees at each, and the seed of its odometry."""
+    for_terrain, for_path, for_odometry, for_sensor = SeedSequence(seed).spawn(4)
+    path = revisiting_path(
+        np.random.default_rng(for_path), submaps * setup.submap_length, setup.frame_spacing
+    )
+    half = np.abs(path.xy).max() + setup.sensor.max_range + 2.0
+    terrain = make_terrain(world, for_terrain, 2 * float(half), setup.terrain_resolution)
+    true = true_poses(terrain, path)
+    seen = [
+        setup.sensor.observe(terrain, T @ setup.T_body_sensor, np.random.default_rng(stream))
+        for T, stream in zip(true, for_sensor.spawn(len(true)), strict=True)
+    ]
+    return true, seen, for_odometry
+
+
+def stitched(setup, true, times, origin, for_odometry):
+    """T_submap_body of each frame by an odometry that drifts some times as much as usual, T_world_submap.
+
+    The origin of a submap is that of one of its frames.
+    """
+    usual, frames = setup.drift, setup.frames
+    drift = replace(
+        usual,
+        position=times * usual.position,
+        heading_deg=times * usual.heading_deg,
+        jitter_deg=usual.jitter_deg if times else 0.0,
+    )
+    estimated, smooth = (
+        estimate(true, frames, d, np.random.default_rng(for_odometry)).local
+        for d in (drift, replace(drift, jitter_deg=0.0))
+    )
+    local, poses = [], []
+    for first in range(0, len(true), frames):
+        at = first + origin % frames
+        x, y, z = smooth[at][:3, 3]
+        T_frame = se3(x, y, z, 0.0, 0.0, yaw_of(smooth[at]))
+        local += [inverse(T_frame) @ T for T in estimated[first : first + frames]]
+        poses.append(true[at] @ inverse(smooth[at]) @ T_frame)
+    return local, np.array(poses)
+
+
+def judged_covariances(setup, seen, local, poses):
+    """Normalised squared errors of the loops of a drive: of all six, (x, y, yaw), (z, roll, pitch), and of
+    all six by the covariances that the loops had when they were decided."""
+    frames = setup.frames
+    with tempfile.TemporaryDirectory() as folder:
+        (clouds := Path(folder) / "clouds").mkdir()
+        for first in range(0, len(local), frames):
+            points = [
+                transform(T @ setup.T_body_sensor, points)
+                for T, points in zip(local[first : first + frames], seen[first : first + frames], strict=True)
+            ]
+            cloud = thin(np.concatenate(points), setup.voxel).astype(np.float32)
+            write_cloud(clouds / f"{first // frames:03d}.ply", cloud)
+        decided = []
+        run = detect_mission(folder, EVIDENCE, on_pair=decided.append, workers=1)
+    truth = GroundTruth(run.submaps, poses)
+    online = {(c.source, c.target): c for c in decided}
+    rows = []
+    for pair in evaluate_pairs(run.loops, truth):
+        c = pair.candidate
+        T = inverse(poses[int(c.target)]) @ poses[int(c.source)]
+        if pair.pose_is_right:
+            earlier = normalised(online[c.source, c.target], T, ALL)
+            rows.append([*(normalised(c, T, part) for part in (ALL, PLANE, REST)), earlier])
+    return rows
+
+
 def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("recall", "null", "errors", "time", "sensors"))
+    parser.add_argument("what", choices=("recall", "null", "errors", "time", "sensors", "covariance"))
     parser.add_argument("folders", nargs="*", type=Path)
     parser.add_argument("--figure", type=Path, help="of what null or errors found, PNG")
     args = parser.parse_args()
-    run = {"recall": recall, "null": null, "errors": errors, "time": query_time, "sensors": sensors}
+    run = {
+        "recall": recall,
+        "null": null,
+        "errors": errors,
+        "time": query_time,
+        "sensors": sensors,
+        "covariance": covariance,
+    }
     run[args.what](args.folders, args.figure)
 
 

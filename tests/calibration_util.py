@@ -24,6 +24,7 @@ from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.matching import decision
 from terrainloop.matching.hypotheses import Pair
 from terrainloop.matching.lift import PlanarPrecision, lift_to_se3
+from terrainloop.matching.mission_warp import warp_variance
 from terrainloop.matching.overlay import Overlay
 from terrainloop.matching.query import Query, rotate, search_grid
 from terrainloop.matching.refine import Refinement, refine
@@ -44,10 +45,13 @@ AFTER_SEARCH = {
     "min_participation",
     "dense_hypotheses",
     "block",
-    "usual_strain",
-    "usual_strain_samples",
-    "motion_by_strain",
-    "rotation_by_strain",
+    "noise_factor",
+    "warp_noise_factor",
+    "usual_warp",
+    "usual_warp_samples",
+    "reach_of_radius",
+    "motion_by_warp",
+    "rotation_by_warp",
 }
 
 
@@ -218,29 +222,36 @@ class Closure:
     refinement: Refinement
     truth: np.ndarray
 
-    def error(self, calibration):
-        """Of the pose, and its covariance by a calibration."""
+    def lifted(self, calibration):
+        """The error of the pose, and its warp by a calibration."""
         refinement = replace(self.refinement, calibration=calibration)
         overlay = Overlay(*self.pair.maps, refinement.T_target_source)
-        precision = PlanarPrecision(refinement.pivot, refinement.covariance, refinement.strain_variance)
-        T, covariance = lift_to_se3(overlay, precision, calibration)
+        precision = PlanarPrecision(refinement.pivot, refinement.covariance)
+        T, warp = lift_to_se3(overlay, precision, calibration)
         error = parameters_of(T) - parameters_of(self.truth)
         error[3:] = (error[3:] + np.pi) % (2 * np.pi) - np.pi
-        return error, covariance
+        return error, warp
 
 
 @cache
-def closures(*names):
-    """The loops of drives by the default settings."""
+def closures(name):
+    """The loops of a drive by the default settings."""
     found = []
-    for name in names:
-        drive, pairs = Drive.of(name), searches_of_revisits(name, 1.0, Settings())
-        for pair, loop in zip(pairs, decided(pairs, Settings()), strict=True):
-            if loop:
-                x, y, yaw = *loop.T_target_source[:2, 3], yaw_of(loop.T_target_source)
-                refinement = refine(*pair.maps, se2(x, y, yaw), Calibration())
-                found.append(Closure(pair, refinement, drive.true_pose(loop)))
+    drive, pairs = Drive.of(name), searches_of_revisits(name, 1.0, Settings())
+    for pair, loop in zip(pairs, decided(pairs, Settings()), strict=True):
+        if loop:
+            x, y, yaw = *loop.T_target_source[:2, 3], yaw_of(loop.T_target_source)
+            refinement = refine(*pair.maps, se2(x, y, yaw), Calibration())
+            found.append(Closure(pair, refinement, drive.true_pose(loop)))
     return found
+
+
+def errors_of(name, calibration):
+    """Errors of the loops of a drive, and their covariances by the warp of all, and by that of each alone."""
+    lifted = [closure.lifted(calibration) for closure in closures(name)]
+    pooled = warp_variance([warp for _, warp in lifted], calibration)
+    together = [(error, warp.covariance(pooled)) for error, warp in lifted]
+    return together, [(error, warp.covariance(warp_variance([warp], calibration))) for error, warp in lifted]
 
 
 def normalised(errors, part):
@@ -248,41 +259,55 @@ def normalised(errors, part):
     return np.array([e[part] @ np.linalg.solve(C[np.ix_(part, part)], e[part]) for e, C in errors])
 
 
+ALL = [0, 1, 2, 3, 4, 5]
+
+
 def of_errors(settings):
     """NEES over its degrees of freedom, and the share within 95 %, of submaps whose odometry drifts."""
-    errors = [closure.error(settings.calibration) for closure in closures(*DRIFTING)]
-    parts = {"all": [0, 1, 2, 3, 4, 5], "x, y": [0, 1], "z": [2], "roll, pitch": [3, 4], "yaw": [5]}
+    drives = [errors_of(name, settings.calibration) for name in DRIFTING]
+    errors = [pair for together, _ in drives for pair in together]
+    single = [pair for _, alone in drives for pair in alone]
+    parts = {"all": ALL, "x, y": [0, 1], "z": [2], "roll, pitch": [3, 4], "yaw": [5]}
     nees = {f"NEES of {name}": normalised(errors, p).mean() / len(p) for name, p in parts.items()}
-    return nees | {"within 95 %": np.mean(normalised(errors, parts["all"]) < chi2.ppf(0.95, 6))}
-
-
-def of_rigid_errors(settings):
-    """The same for submaps without drift: with strain, and of x, y, yaw from noise alone."""
-    rigid = closures(RIGID)
-    errors = [closure.error(settings.calibration) for closure in rigid]
-    no_strain = {"motion_by_strain": (0.0, 0.0, 0.0), "rotation_by_strain": (0.0, 0.0, 0.0)}
-    noise_only = [closure.error(settings.calibration.model_copy(update=no_strain)) for closure in rigid]
-    return {
-        "within 95 %, rigid": np.mean(normalised(errors, [0, 1, 2, 3, 4, 5]) < chi2.ppf(0.95, 6)),
-        "NEES of noise, rigid": normalised(noise_only, [0, 1, 5]).mean() / 3,
+    return nees | {
+        "within 95 %": np.mean(normalised(errors, ALL) < chi2.ppf(0.95, 6)),
+        "NEES of loops alone": normalised(single, ALL).mean() / 6,
     }
 
 
-def of_stretched_maps(settings):
-    """The strain found between maps of which one is stretched by a fiftieth, over the true one (RMS)."""
-    options = {"origin": (-4.0, -4.0), "shape": (100, 100)}
+def of_rigid_errors(settings):
+    """The same for submaps without drift, and by noise alone."""
+    errors, _ = errors_of(RIGID, settings.calibration)
+    rigid = [closure.lifted(settings.calibration) for closure in closures(RIGID)]
+    noise_only = [(error, warp.rigid) for error, warp in rigid]
+    return {
+        "NEES, rigid": normalised(errors, ALL).mean() / 6,
+        "within 95 %, rigid": np.mean(normalised(errors, ALL) < chi2.ppf(0.95, 6)),
+        "NEES of noise, rigid": normalised(noise_only, ALL).mean() / 6,
+    }
 
-    def stretched(seed, xy):
-        height, slope = heights_and_slopes(seed)(xy * [1.02, 0.98])
-        return height, slope * [1.02, 0.98]
+
+def of_warped_maps(settings):
+    """The warp found between maps of which one rises by a hundredth of the radius, over the true one."""
+    options = {"origin": (-4.0, -4.0), "shape": (100, 100)}
+    bend = 0.01 / 3.3  # per metre
+
+    def warped(seed, xy):
+        height, slope = heights_and_slopes(seed)(xy)
+        x, y = xy.T
+        return height + bend * x * y, slope + bend * np.c_[y, x]
 
     ratios = []
     for seed in range(3):
-        source = map_of(lambda xy, seed=seed: stretched(seed, xy), **options)
+        source = map_of(lambda xy, seed=seed: warped(seed, xy), **options)
         target = World.of(seed).map(**options)
-        variance = refine(source, target, np.eye(3), settings.calibration).strain_variance
-        ratios.append(np.sqrt(variance / (0.02**2 / 3)))  # half of it along x and y each, of no shear
-    return {"strain found": np.mean(ratios)}
+        refinement = refine(source, target, np.eye(3), settings.calibration)
+        precision = PlanarPrecision(refinement.pivot, refinement.covariance)
+        overlay = Overlay(source, target, refinement.T_target_source)
+        warp = lift_to_se3(overlay, precision, settings.calibration)[1]
+        variance = warp_variance([warp], settings.calibration)
+        ratios.append(np.sqrt(variance / (0.005**2 / 6)))  # one of three parts, of two submaps
+    return {"warp found": np.mean(ratios)}
 
 
 def heights_and_slopes(seed, amplitude=1.0):

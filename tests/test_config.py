@@ -291,7 +291,7 @@ def test_a_knob_that_promises_nothing_is_refused(value, file):
 
 
 def test_the_calibration_is_written_beside_every_result(file):
-    changed = Settings.model_validate({"calibration": {"tail": 0.9, "motion_by_strain": (1.0, 2.0, 3.0)}})
+    changed = Settings.model_validate({"calibration": {"tail": 0.9, "motion_by_warp": (1.0, 2.0, 3.0)}})
     file.write_text(changed.to_yaml())
     assert "tail: 0.9" in changed.to_yaml()
     assert Settings.from_yaml(file) == changed

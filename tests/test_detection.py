@@ -17,6 +17,7 @@ from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.io.missions import load_mission
 from terrainloop.io.results import write_loops
 from terrainloop.loop import LoopCandidate
+from terrainloop.matching.mission_warp import warp_variance
 from terrainloop.submap import Submap
 
 PARAMETERS = Hyperparameters(0.4, 0.01, 0.011)
@@ -258,6 +259,29 @@ def test_mission_is_the_same_for_two_processes(detected, mission_folder, strict,
     for name in names:
         assert (one.folder / name).read_bytes() == (two.folder / name).read_bytes()
     assert one.num_pairs == two.num_pairs == 3
+
+
+def test_covariances_are_those_of_the_warp_of_all_loops_so_far(mapped, strict):
+    again = {
+        f"{name} again": replace(submap, record=replace(submap.record, name=f"{name} again"))
+        for name, submap in mapped.items()
+    }
+    detector, found, _ = run(mapped | again, strict.model_copy(update={"skip_recent": 0}), null_scores=[])
+    assert sum(map(bool, found)) >= 3
+    known = []
+    for loops in found:
+        known += [loop.warp for loop in loops]
+        for loop in loops:
+            variance = warp_variance(known, strict.calibration)
+            np.testing.assert_array_equal(loop.covariance, loop.warp.covariance(variance))
+    assert [loop.warp for loop in detector.loops] == known
+
+
+def test_loops_of_a_mission_have_the_covariance_of_the_whole_mission(detected, strict):
+    run, _ = detected
+    variance = warp_variance([loop.warp for loop in run.loops], strict.calibration)
+    for loop in run.loops:
+        np.testing.assert_array_equal(loop.covariance, loop.warp.covariance(variance))
 
 
 def test_mission_with_a_fit_for_each_submap(mission_folder, strict):

@@ -12,9 +12,12 @@ from scipy.stats import beta
 from terrainloop.config import Calibration
 from terrainloop.entry import MapEntry
 from terrainloop.geometry import inverse, se2, se3, transform, yaw_of
-from terrainloop.loop import NO_EVIDENCE
+from terrainloop.loop import NO_EVIDENCE, Warp
 from terrainloop.matching import significance
 from terrainloop.matching.covariance import block_covariance
+from terrainloop.matching.lift import PlanarPrecision, lift_to_se3
+from terrainloop.matching.mission_warp import warp_variance
+from terrainloop.matching.overlay import Overlay
 from terrainloop.matching.refine import refine
 from terrainloop.matching.register import compare, register
 from terrainloop.record import SubmapRecord
@@ -165,7 +168,7 @@ def test_no_more_blocks_than_parameters_tell_nothing(blocks):
 
 
 def test_the_pose_errs_no_more_than_its_covariance_says(world, gp_map):
-    """Maps of noisy points, each ground seen twice: sigmas are short by less than 1.9, before strain."""
+    """Maps of noisy points, each ground seen twice, rigid: sigmas are short by less than 1.9."""
     T = se2(0.4, -0.3, 0.7)
     frame = se3(0.4, -0.3, 0.0, 0.0, 0.0, 0.7)
     values = []
@@ -180,19 +183,50 @@ def test_the_pose_errs_no_more_than_its_covariance_says(world, gp_map):
     assert 1.5 < np.mean(values) < 10.0  # 3 where they are not short
 
 
-def test_maps_that_are_stretched_are_found_so(world):
-    """A hundredth between two maps; between rigid ones less than is usual."""
-    ground = world(0)._height_and_slope
+def warp_between(source, target):
+    found = refine(source, target, np.eye(3), CALIBRATION)
+    precision = PlanarPrecision(found.pivot, found.covariance)
+    return lift_to_se3(Overlay(source, target, found.T_target_source), precision, CALIBRATION)[1]
 
-    def stretched(xy):
-        height, slope = ground(xy * [1.01, 0.99])
-        return height, slope * [1.01, 0.99]
+
+def test_maps_that_are_warped_are_found_so(world):
+    """By a rise of a two-hundredth of the radius between two maps; rigid ones by less than is usual."""
+    ground, bend = world(0)._height_and_slope, 0.005 / 3.3
+
+    def warped(xy):
+        height, slope = ground(xy)
+        x, y = xy.T
+        return height + bend * x * y, slope + bend * np.c_[y, x]
 
     target = world(0).map(**BIG)
-    rigid = refine(world(0).map(**BIG), target, np.eye(3), CALIBRATION).strain_variance
-    strained = refine(map_of(stretched, **BIG), target, np.eye(3), CALIBRATION).strain_variance
-    assert np.sqrt(rigid) < CALIBRATION.usual_strain
-    assert np.sqrt(strained) == pytest.approx(0.01 / np.sqrt(2), rel=0.3)
+    rigid, bent = (warp_between(source, target) for source in (world(0).map(**BIG), map_of(warped, **BIG)))
+    assert np.sqrt(warp_variance([rigid], CALIBRATION)) < CALIBRATION.usual_warp
+    assert np.sqrt(bent.squares) == pytest.approx([0, 0.0025 / np.sqrt(2), 0], abs=3e-4)
+
+
+def samples(squares, noise, count):
+    return [Warp(np.full(3, squares), np.full(3, noise), np.eye(6), np.eye(6))] * count
+
+
+def test_the_warp_of_a_mission_is_the_usual_one_until_its_loops_tell():
+    usual = CALIBRATION.usual_warp**2
+    assert warp_variance([], CALIBRATION) == pytest.approx(usual)
+    assert warp_variance(samples(np.nan, np.nan, 9), CALIBRATION) == pytest.approx(usual)
+    assert warp_variance(samples(1e6 * usual, 1e6 * usual, 9), CALIBRATION) == pytest.approx(usual, rel=1e-3)
+    one, many = (warp_variance(samples(25 * usual, 0, n), CALIBRATION) / usual for n in (1, 100))
+    assert 1 < one < many
+    assert many == pytest.approx(25, rel=0.02)
+    assert warp_variance(samples(0.0, 0.0, 100), CALIBRATION) < 0.01 * usual
+
+
+def test_the_noise_of_a_warp_is_not_taken_for_warp():
+    """Samples about a warp of a given size, each with a noise of its own."""
+    rng, usual = np.random.default_rng(0), CALIBRATION.usual_warp**2
+    for true in (0.0, usual, 16 * usual):
+        noise = usual * rng.uniform(0.1, 10.0, (2000, 3))
+        squares = rng.standard_normal((2000, 3)) ** 2 * (true + noise)
+        warps = [Warp(s, n, np.eye(6), np.eye(6)) for s, n in zip(squares, noise, strict=True)]
+        assert warp_variance(warps, CALIBRATION) == pytest.approx(true, abs=0.1 * max(true, usual))
 
 
 # --- the decision

@@ -56,7 +56,7 @@ def test_loops_round_trip(tmp_path):
     path = tmp_path / "loops.csv"
     write_loops(path, _candidates())
     for again, candidate in zip(read_loops(path), _candidates(), strict=True):
-        for field in fields(LoopCandidate):
+        for field in (field for field in fields(LoopCandidate) if field.name != "warp"):
             value, expected = getattr(again, field.name), getattr(candidate, field.name)
             tolerance = 1e-15 if field.name == "T_target_source" else 0  # through angles and back
             if isinstance(expected, str):

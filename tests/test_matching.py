@@ -32,7 +32,9 @@ def compute_ssd(source, target, T):
 
 
 def lift(source, target, T, pivot, covariance):
-    return lift_to_se3(Overlay(source, target, T), PlanarPrecision(pivot, covariance), Calibration())
+    """The transform and its covariance, of rigid submaps."""
+    lifted, warp = lift_to_se3(Overlay(source, target, T), PlanarPrecision(pivot, covariance), Calibration())
+    return lifted, warp.rigid
 
 
 SHIFT = se3(*UTM, 0.0, 0.0, 0.0)
@@ -460,9 +462,7 @@ def test_covariance_is_calibrated_over_many_places(world):
         estimate = fit_se2(keypoints, matched)
         moved = transform(estimate, keypoints)
         planar = covariance_of_inliers(moved - pivot, moved - matched, floor=1e-3)
-        lifted, covariance = lift_to_se3(
-            Overlay(source, target, estimate), PlanarPrecision(pivot, planar), Calibration()
-        )
+        lifted, covariance = lift(source, target, estimate, pivot, planar)
         error = (parameters_of(lifted) - [0.5, -0.3, 0, 0, 0, 2.0])[[0, 1, 5]]
         planar = covariance[np.ix_([0, 1, 5], [0, 1, 5])]
         values.append(error @ np.linalg.solve(planar, error))
@@ -491,9 +491,7 @@ def test_lift_finds_height_and_tilt(world, tilt, yaw):
 
 def test_lift_without_shared_ground_leaves_height_and_tilt_open(world):
     T = se2(100.0, 0.0, 0.3)
-    lifted, covariance = lift_to_se3(
-        Overlay(world(0).map(), world(0).map(), T), PlanarPrecision(np.ones(2), np.eye(3)), Calibration()
-    )
+    lifted, covariance = lift(world(0).map(), world(0).map(), T, np.ones(2), np.eye(3))
     np.testing.assert_allclose(lifted, se3(100.0, 0.0, 0.0, 0.0, 0.0, 0.3), rtol=0, atol=1e-12)
     assert np.isnan(covariance).all()
 

@@ -40,10 +40,13 @@ void visit_numbers(Calibration& c, const Visit& visit) {
   visit("equivalence_ratio", c.equivalence_ratio);
   visit("ambiguity_chance", c.ambiguity_chance);
   visit("block", c.block);
-  visit("usual_strain", c.usual_strain);
-  visit("usual_strain_samples", c.usual_strain_samples);
-  visit("motion_by_strain", c.motion_by_strain);
-  visit("rotation_by_strain", c.rotation_by_strain);
+  visit("noise_factor", c.noise_factor);
+  visit("warp_noise_factor", c.warp_noise_factor);
+  visit("usual_warp", c.usual_warp);
+  visit("usual_warp_samples", c.usual_warp_samples);
+  visit("reach_of_radius", c.reach_of_radius);
+  visit("motion_by_warp", c.motion_by_warp);
+  visit("rotation_by_warp", c.rotation_by_warp);
 }
 
 nb::dict calibration() {

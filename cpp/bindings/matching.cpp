@@ -124,8 +124,7 @@ nb::object settle(const GradientArrays& source, const GradientArrays& target, co
       to_numpy<double>({c, -s, x, s, c, y, 0, 0, 1}, {3, 3}),
       to_numpy<double>({found->pivot_x, found->pivot_y}, {2}), to_numpy(std::move(found->ground), {count, 2}),
       to_numpy(std::move(found->residual), {2, count}), to_numpy(std::move(found->weights), {2, count}),
-      to_numpy(std::move(found->by_motion), {2, count, 5}),
-      to_numpy(std::move(found->by_strain), {2, count, 3}));
+      to_numpy(std::move(found->slopes), {2, count}), to_numpy(std::move(found->by_motion), {2, count, 5}));
 }
 
 }  // namespace

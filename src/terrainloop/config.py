@@ -182,13 +182,20 @@ class Calibration(_Frozen):
     ambiguity_chance: float = Field(0.01, gt=0, description="NFA above which a rival is left to chance")
     # Covariance (section 4)
     block: float = Field(2.0, gt=0, description="side of the independent blocks of ground, length scales")
-    usual_strain: float = Field(0.004, ge=0, description="standard deviation of a submap's strain, a priori")
-    usual_strain_samples: float = Field(3.0, gt=0, description="number of samples that this prior is worth")
-    motion_by_strain: _Triple = Field(
-        (2.0, 2.0, 0.5), description="variance of x, y, z per squared metre of reach, per strain variance"
+    noise_factor: float = Field(
+        2.5, gt=0, description="variance of a pose by noise, over that of independent blocks"
     )
-    rotation_by_strain: _Triple = Field(
-        (0.7, 0.7, 8.0), description="variance of roll, pitch, yaw per strain variance"
+    warp_noise_factor: float = Field(5.0, gt=0, description="the same of a warp")
+    usual_warp: float = Field(0.0009, gt=0, description="standard deviation of a submap's warp, a priori")
+    usual_warp_samples: float = Field(1.0, gt=0, description="number of samples that this prior is worth")
+    reach_of_radius: float = Field(
+        2.8, ge=0, description="squared reach per squared radius of the shared ground"
+    )
+    motion_by_warp: _Triple = Field(
+        (60.0, 60.0, 26.0), description="variance of x, y, z per squared metre of reach, per warp variance"
+    )
+    rotation_by_warp: _Triple = Field(
+        (40.0, 40.0, 350.0), description="variance of roll, pitch, yaw per warp variance"
     )
 
 

@@ -1,6 +1,6 @@
 """What is known about one pair of submaps: the transform between them, the evidence, the decision."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,31 @@ NO_EVIDENCE = -10.0
 
 def _frame_origin() -> NDArray[np.float64]:
     return np.zeros(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Warp(ReadOnlyArrays):
+    """How far from rigid two submaps are, and what that adds to the covariance of their loop.
+
+    Attributes
+    ----------
+    squares, noise : array, (3,)
+        Samples of the variance of the warp of one submap, dimensionless, and the parts of them that noise
+        accounts for.
+    rigid : array, (6, 6)
+        Covariance of the loop if the submaps are rigid.
+    by_variance : array, (6, 6)
+        What is added to it per unit of the variance of the warp.
+    """
+
+    squares: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    rigid: NDArray[np.float64]
+    by_variance: NDArray[np.float64]
+
+    def covariance(self, variance: float) -> NDArray[np.float64]:
+        """Covariance (6, 6) of the loop, for a variance of the warp."""
+        return self.rigid + variance * self.by_variance
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -56,6 +81,9 @@ class LoopCandidate(ReadOnlyArrays):
     source_origin, target_origin : array, (3,)
         Points of the two frames, metres, that `T_local` and the covariance refer to: zero, or a point near
         the submap where its frame's origin is far away (UTM).
+    warp : Warp or None
+        Of a loop closure: what its covariance is made of. None where the run decides by inliers, and in a run
+        that was read from a file.
     """
 
     source: str
@@ -75,6 +103,7 @@ class LoopCandidate(ReadOnlyArrays):
     inlier_score: float = np.nan
     source_origin: NDArray[np.float64] = field(default_factory=_frame_origin)
     target_origin: NDArray[np.float64] = field(default_factory=_frame_origin)
+    warp: Warp | None = None
 
     def __post_init__(self) -> None:
         for name in ("T_target_source", "covariance", "source_origin", "target_origin"):
@@ -98,6 +127,11 @@ class LoopCandidate(ReadOnlyArrays):
             accepted=False,
             reason=reason,
         )
+
+    def rejected(self, reason: str) -> "LoopCandidate":
+        """The candidate as no loop closure, for a reason; nothing is said of how sure its pose is."""
+        unknown = np.full((6, 6), np.nan)
+        return replace(self, accepted=False, covariance=unknown, warp=None, reason=reason)
 
     def __bool__(self) -> bool:
         return self.accepted

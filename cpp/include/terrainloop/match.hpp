@@ -38,11 +38,14 @@ struct Calibration {
   double equivalence_ratio = 0.7;  ///< the same, above which a rival counts however likely it is by chance
   double ambiguity_chance = 0.01;  ///< NFA above which a rival is left to chance
   // Covariance
-  double block = 2.0;                 ///< side of the independent blocks of ground, length scales
-  double usual_strain = 0.004;        ///< standard deviation of a submap's strain, a priori
-  double usual_strain_samples = 3.0;  ///< samples that this prior is worth
-  std::array<double, 3> motion_by_strain = {2.0, 2.0, 0.5};    ///< variance of x, y, z per m^2 of reach
-  std::array<double, 3> rotation_by_strain = {0.7, 0.7, 8.0};  ///< variance of roll, pitch, yaw
+  double block = 2.0;               ///< side of the independent blocks of ground, length scales
+  double noise_factor = 2.5;        ///< variance of a pose by noise, over that of independent blocks
+  double warp_noise_factor = 5.0;   ///< the same of a warp
+  double usual_warp = 0.0009;       ///< standard deviation of a submap's warp, a priori
+  double usual_warp_samples = 1.0;  ///< samples that this prior is worth
+  double reach_of_radius = 2.8;     ///< squared reach per squared radius of the shared ground
+  std::array<double, 3> motion_by_warp = {60.0, 60.0, 26.0};     ///< variance of x, y, z per m^2 of reach
+  std::array<double, 3> rotation_by_warp = {40.0, 40.0, 350.0};  ///< variance of roll, pitch, yaw
 };
 
 struct MatchSettings {

@@ -34,9 +34,9 @@ struct Linearised {
   std::vector<double> ground;    ///< N x 2, metres
   std::vector<double> residual;  ///< 2 x N: target less rotated source, of the components x and y
   std::vector<double> weights;   ///< 2 x N
+  std::vector<double> slopes;  ///< 2 x N: derivatives of weights times residuals by the residuals, 0 at least
   std::vector<double>
       by_motion;  ///< 2 x N x 5: x, y, rotation about the pivot, difference in slope along x and y
-  std::vector<double> by_strain;  ///< 2 x N x 3: along x, along y, shear
 };
 
 /// Refines a motion on the gradients, by Gauss-Newton with Cauchy's weights; empty if the overlap of the maps

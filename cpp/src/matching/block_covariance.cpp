@@ -41,7 +41,7 @@ MatrixXd block_covariance(const MatrixXd& jacobian, const VectorXd& weighted, co
   const Eigen::Index blocks = sums.rows(), parameters = jacobian.cols();
   const MatrixXd unknown =
       MatrixXd::Constant(parameters, parameters, std::numeric_limits<double>::quiet_NaN());
-  const VectorXd scale = normal.diagonal().cwiseSqrt();
+  const VectorXd scale = normal.diagonal().cwiseMax(0.0).cwiseSqrt();
   if (blocks <= parameters || !(scale.minCoeff() > 0.0) || !scale.allFinite()) return unknown;
   const MatrixXd scaled = (scale.cwiseInverse().asDiagonal() * normal) * scale.cwiseInverse().asDiagonal();
   if (!(condition(scaled) <= kMaxCondition)) return unknown;

@@ -16,36 +16,81 @@ namespace {
 constexpr Eigen::Index kMinPixels = 10;  // that determine a tilt
 constexpr double kOutlier = 3.0;         // robust standard deviations of an elevation difference
 constexpr double kNormal = 1.4826;       // standard deviations in a median absolute deviation
+constexpr int kSteps = 10;               // in which the weights of the samples of a warp settle
 constexpr double kFar = 10.0;            // radii of the map, from which its frame's origin is no longer near
 constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
 
-/// Elevation difference as z + w_x y - w_y x.
-struct Plane {
-  Vector3d parameters;  ///< (z, w_x, w_y)
-  Matrix3d covariance;
+/// What is left of a least-squares fit of the elevation difference.
+struct Fit {
+  VectorXd parameters;
+  MatrixXd covariance;  ///< NaN if undetermined
 };
 
-/// The rows that are kept of a fit.
-struct Samples {
+/// The elevation difference over the ground that two maps share.
+struct Ground {
   Positions positions;  ///< from the pivot
   VectorXd difference;
+  Positions slope;
 
+  /// Its derivative by (z, w_x, w_y).
   MatrixXd design() const {
     MatrixXd columns(positions.rows(), 3);
     columns << VectorXd::Ones(positions.rows()), positions.col(1), -positions.col(0);
     return columns;
   }
 
-  Vector3d fit() const {
-    const MatrixXd columns = design();
-    const Matrix3d normal = columns.transpose() * columns;
-    return normal.completeOrthogonalDecomposition().solve(columns.transpose() * difference);
+  /// Its derivative by (x, y, yaw) of the alignment.
+  MatrixXd by_alignment() const {
+    MatrixXd columns(positions.rows(), 3);
+    columns << slope,
+        positions.col(0).cwiseProduct(slope.col(1)) - positions.col(1).cwiseProduct(slope.col(0));
+    return columns;
   }
 
-  VectorXd residual(const Vector3d& plane) const { return difference - design() * plane; }
+  /// Root mean square distance from the pivot.
+  double radius() const { return std::sqrt(positions.squaredNorm() / static_cast<double>(positions.rows())); }
 
-  Samples of(const std::vector<Eigen::Index>& rows) const {
-    return {positions(rows, Eigen::all), difference(rows)};
+  /// The design and, as rises over the radius, the second-degree parts.
+  MatrixXd bent_design() const {
+    const double unit = radius();
+    const Eigen::ArrayXd x = positions.col(0).array() / unit, y = positions.col(1).array() / unit;
+    MatrixXd columns(positions.rows(), 6);
+    columns << design(), unit * (x.square() - y.square()), 2.0 * unit * x * y,
+        unit * (x.square() + y.square() - 1.0);
+    return columns;
+  }
+
+  Ground of(const std::vector<Eigen::Index>& rows) const {
+    return {positions(rows, Eigen::all), difference(rows), slope(rows, Eigen::all)};
+  }
+
+  Fit fit(const MatrixXd& columns, double block) const {
+    const MatrixXd normal = columns.transpose() * columns;
+    const VectorXd parameters =
+        normal.completeOrthogonalDecomposition().solve(columns.transpose() * difference);
+    const VectorXd residual = difference - columns * parameters;
+    return {parameters, block_covariance(columns, residual, normal, positions, block)};
+  }
+};
+
+/// Elevation difference as z + w_x y - w_y x, and the rest of it.
+struct Plane {
+  Vector3d parameters;    ///< (z, w_x, w_y)
+  Matrix3d covariance;    ///< by the scatter of the elevations
+  Matrix3d by_alignment;  ///< derivative of the parameters by (x, y, yaw) of the alignment
+  double warp_variance;   ///< of one submap
+  double radius;          ///< of the ground, metres
+
+  /// Of (x, y, z, w_x, w_y, yaw) at the pivot, from that of (x, y, yaw).
+  Matrix6d covariance_with(const Matrix3d& alignment) const {
+    const std::array<int, 3> planar = {0, 1, 5}, tilt = {2, 3, 4};
+    const Matrix3d both = by_alignment * alignment;
+    Matrix6d result;
+    result(planar, planar) = alignment;
+    result(tilt, planar) = both;
+    result(planar, tilt) = both.transpose();
+    result(tilt, tilt) = covariance + both * by_alignment.transpose();
+    return result;
   }
 };
 
@@ -61,25 +106,48 @@ std::vector<Eigen::Index> inliers(const VectorXd& residual) {
   return rows;
 }
 
-/// By least squares with outliers rejected once; nothing if undetermined.
-std::optional<Plane> fit_plane(const Samples& samples, double block) {
-  if (samples.difference.size() < kMinPixels) return std::nullopt;
-  const Samples kept = samples.of(inliers(samples.residual(samples.fit())));
-  if (kept.difference.size() < kMinPixels) return std::nullopt;
-  const Vector3d plane = kept.fit();
-  const MatrixXd design = kept.design();
-  const MatrixXd covariance =
-      block_covariance(design, kept.residual(plane), design.transpose() * design, kept.positions, block);
-  if (covariance.hasNaN()) return std::nullopt;
-  return Plane{plane, covariance};
+/// Of one submap, from the second-degree parts of this pair less their noise, and what is usual.
+double warp_variance(const Eigen::Array3d& squares, const Eigen::Array3d& noise, const Calibration& c) {
+  const double usual = c.usual_warp * c.usual_warp, prior = c.usual_warp_samples;
+  if (noise.isNaN().any()) return usual;
+  double variance = usual;
+  for (int step = 0; step < kSteps; ++step) {
+    const Eigen::Array3d weights = (1.0 + noise / std::max(variance, usual)).square().inverse();
+    const double excess = std::max((weights * (squares - noise)).sum(), 0.0);
+    variance = (prior * usual + excess) / (prior + weights.sum());
+  }
+  return variance;
 }
 
-Samples samples_of(const Overlay& overlay, const Vector2d& pivot) {
+/// By least squares, after outliers from a bent plane were rejected; nothing if undetermined.
+std::optional<Plane> fit_plane(const Ground& ground, const Calibration& calibration, double length_scale) {
+  if (ground.difference.size() < kMinPixels) return std::nullopt;
+  const double block = calibration.block * length_scale;
+  const MatrixXd all = ground.bent_design();
+  const VectorXd first =
+      (all.transpose() * all).completeOrthogonalDecomposition().solve(all.transpose() * ground.difference);
+  const Ground kept = ground.of(inliers(ground.difference - all * first));
+  if (kept.difference.size() < kMinPixels) return std::nullopt;
+  const MatrixXd columns = kept.design();
+  const Fit plane = kept.fit(columns, block), bent = kept.fit(kept.bent_design(), block);
+  if (plane.covariance.hasNaN()) return std::nullopt;
+  const double radius = kept.radius();
+  const Eigen::Array3d warp = bent.parameters.tail<3>();
+  const Eigen::Array3d noise = calibration.warp_noise_factor * bent.covariance.diagonal().tail<3>();
+  const Matrix3d by_alignment = (columns.transpose() * columns)
+                                    .completeOrthogonalDecomposition()
+                                    .solve(columns.transpose() * kept.by_alignment());
+  return Plane{plane.parameters, calibration.noise_factor * plane.covariance, by_alignment,
+               warp_variance(warp.square() / 2.0, noise / 2.0, calibration), radius};
+}
+
+Ground ground_of(const Overlay& overlay, const Vector2d& pivot) {
   const auto count = static_cast<Eigen::Index>(overlay.source_elevation.size());
-  const Eigen::Map<const Positions> positions(overlay.positions.data(), count, 2);
+  const Eigen::Map<const Positions> positions(overlay.positions.data(), count, 2),
+      slope(overlay.slope.data(), count, 2);
   const Eigen::Map<const VectorXd> source(overlay.source_elevation.data(), count),
       target(overlay.target_elevation.data(), count);
-  return {positions.rowwise() - pivot.transpose(), target - source};
+  return {positions.rowwise() - pivot.transpose(), target - source, slope};
 }
 
 /// Distance from a position to the local origin, or to the point of the map nearest to it: over this distance
@@ -107,18 +175,14 @@ Matrix6d at_local_origin(const Matrix6d& covariance, const Vector3d& arm, double
   return (moved + moved.transpose()) / 2.0;  // rounding breaks the symmetry
 }
 
-/// Of (x, y, z, w_x, w_y, yaw) at the pivot.
-Matrix6d covariance_at_pivot(const PlanarPrecision& precision, const Matrix3d& of_plane, double squared_reach,
-                             const Calibration& calibration) {
-  const std::array<int, 3> planar = {0, 1, 5}, tilt = {2, 3, 4};
-  Matrix6d covariance = Matrix6d::Zero();
-  covariance(planar, planar) = precision.covariance;
-  covariance(tilt, tilt) = of_plane;
+/// What a warp adds to the covariance of (x, y, z, w_x, w_y, yaw) at the pivot.
+Matrix6d by_warp(double variance, double squared_reach, const Calibration& calibration) {
+  Matrix6d added = Matrix6d::Zero();
   for (int i = 0; i < 3; ++i) {
-    covariance(i, i) += precision.strain_variance * squared_reach * calibration.motion_by_strain[i];
-    covariance(3 + i, 3 + i) += precision.strain_variance * calibration.rotation_by_strain[i];
+    added(i, i) = variance * squared_reach * calibration.motion_by_warp[i];
+    added(3 + i, 3 + i) = variance * calibration.rotation_by_warp[i];
   }
-  return covariance;
+  return added;
 }
 
 Matrix4d in_space(const Matrix3d& R, const Vector3d& translation) {
@@ -149,7 +213,7 @@ Lifted lift_to_se3(const Anchored& source, const Anchored& target, const Overlay
   Matrix3d turn = Matrix3d::Identity();
   turn.topLeftCorner<2, 2>() = T_planar.topLeftCorner<2, 2>();
   const std::optional<Plane> plane =
-      fit_plane(samples_of(overlay, pivot), calibration.block * target.map.length_scale);
+      fit_plane(ground_of(overlay, pivot), calibration, target.map.length_scale);
   if (!plane) return {in_space(turn, {T_planar(0, 2), T_planar(1, 2), 0.0}), Matrix6d::Constant(kNan)};
   const auto [z, w_x, w_y] = std::array{plane->parameters[0], plane->parameters[1], plane->parameters[2]};
   const Matrix3d R = Eigen::AngleAxisd(w_y, Vector3d::UnitY()).toRotationMatrix() *
@@ -160,8 +224,10 @@ Lifted lift_to_se3(const Anchored& source, const Anchored& target, const Overlay
   const Vector2d pivot_planar = transform(inverse(T_planar), pivot);
   const Vector3d pivot_source(pivot_planar.x(), pivot_planar.y(), height);
   const Vector3d pivot_target(pivot.x(), pivot.y(), height + z);
-  const double squared_reach = std::pow(reach(target, pivot), 2) + std::pow(reach(source, pivot_planar), 2);
-  const Matrix6d covariance = covariance_at_pivot(precision, plane->covariance, squared_reach, calibration);
+  const double away = std::pow(reach(target, pivot), 2) + std::pow(reach(source, pivot_planar), 2);
+  const double squared_reach = away + 2.0 * calibration.reach_of_radius * std::pow(plane->radius, 2);
+  const Matrix6d covariance = plane->covariance_with(precision.covariance) +
+                              by_warp(plane->warp_variance, squared_reach, calibration);
   const double yaw = std::atan2(R(1, 0), R(0, 0));
   return {in_space(R, pivot_target - R * pivot_source),
           at_local_origin(covariance, R * (pivot_source - source.local_origin), yaw)};

@@ -14,11 +14,10 @@ using Eigen::Matrix4d;
 using Eigen::Vector3d;
 using Matrix6d = Eigen::Matrix<double, 6, 6>;
 
-/// How well an SE(2) alignment is known.
+/// How well an SE(2) alignment of rigid submaps is known.
 struct PlanarPrecision {
   Vector2d pivot;       ///< in the target frame, metres
   Matrix3d covariance;  ///< of (x, y, yaw) at the pivot
-  double strain_variance;
 };
 
 struct Lifted {

@@ -163,9 +163,8 @@ Match without_transform(const std::string& reason) {
 Match decided(const Pair& pair, const Weighed& weighed, const std::optional<Refinement>& refinement) {
   const Matrix3d T = refinement ? refinement->T_target_source() : weighed.best.T_target_source;
   const PlanarPrecision precision =
-      refinement
-          ? PlanarPrecision{refinement->pivot(), refinement->covariance(), refinement->strain_variance()}
-          : PlanarPrecision{transform(T, pair.source_field.centre), Matrix3d::Constant(kNan), 0.0};
+      refinement ? PlanarPrecision{refinement->pivot(), refinement->covariance()}
+                 : PlanarPrecision{transform(T, pair.source_field.centre), Matrix3d::Constant(kNan)};
   const Overlay shared = overlay(pair.source, pair.target, T, refinement ? 1 : kRejectedStep);
   const Anchored source{pair.source, local_origin(pair.source)},
       target{pair.target, local_origin(pair.target)};

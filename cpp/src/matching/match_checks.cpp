@@ -75,19 +75,22 @@ void check_map(const GradientMapView& map, const char* name) {
 void check_settings(const MatchSettings& settings) {
   const Calibration& c = settings.calibration;
   require(positive({settings.pairs, settings.max_false_loops}), "pairs and max_false_loops must be positive");
-  require(sensible({c.pixels_per_length_scale, c.blur, c.spectrum_smoothing, c.whitening_floor, c.clip,
-                    c.rotation_step, c.min_shared_area, c.min_separation, c.peak_threshold, c.wraparound,
-                    c.tail, c.independent_tests, c.max_correlation, c.ambiguity_ratio, c.equivalence_ratio,
-                    c.ambiguity_chance, c.block, c.usual_strain_samples},
-                   1e-6),
-          "the numbers of the calibration must be within 1e-6 and 1e6");
-  require(sensible({c.min_correlation, c.min_participation, c.usual_strain, c.motion_by_strain[0], c.motion_by_strain[1],
-                    c.motion_by_strain[2], c.rotation_by_strain[0], c.rotation_by_strain[1],
-                    c.rotation_by_strain[2]},
+  require(
+      sensible({c.pixels_per_length_scale, c.blur, c.spectrum_smoothing, c.whitening_floor, c.clip,
+                c.rotation_step, c.min_shared_area, c.min_separation, c.peak_threshold, c.wraparound, c.tail,
+                c.independent_tests, c.max_correlation, c.ambiguity_ratio, c.equivalence_ratio,
+                c.ambiguity_chance},
+               1e-6) &&
+          sensible({c.block, c.noise_factor, c.warp_noise_factor, c.usual_warp, c.usual_warp_samples}, 1e-6),
+      "the numbers of the calibration must be within 1e-6 and 1e6");
+  require(sensible({c.min_correlation, c.min_participation, c.reach_of_radius, c.motion_by_warp[0],
+                    c.motion_by_warp[1], c.motion_by_warp[2], c.rotation_by_warp[0], c.rotation_by_warp[1],
+                    c.rotation_by_warp[2]},
                    0.0),
-          "min_correlation, min_participation and strains must be within 0 and 1e6");
-  require(c.wraparound <= 1.0 && c.max_correlation < 1.0 && c.min_correlation < 1.0 && c.min_participation < 1.0,
-          "wraparound must be at most 1, correlations below 1");
+          "min_correlation, min_participation, reaches and warps must be within 0 and 1e6");
+  require(
+      c.wraparound <= 1.0 && c.max_correlation < 1.0 && c.min_correlation < 1.0 && c.min_participation < 1.0,
+      "wraparound must be at most 1, correlations below 1");
   require(c.max_pixels >= 8 && c.candidates >= 1 && c.dense_hypotheses >= 0,
           "max_pixels must be at least 8, candidates 1, dense_hypotheses 0");
 }

@@ -51,6 +51,7 @@ Overlay overlay(const GradientMapView& source, const GradientMapView& target, co
                                                        target.origin_y + row * target.resolution});
       shared.source_elevation.push_back(bilinear(source.elevation, at));
       shared.target_elevation.push_back(target.elevation(row, col));
+      shared.slope.insert(shared.slope.end(), {target.gradient_x(row, col), target.gradient_y(row, col)});
     }
   const double pixel = std::pow(step * target.resolution, 2);
   const double area = static_cast<double>(shared.source_elevation.size()) * pixel;

@@ -11,6 +11,7 @@ namespace terrainloop::matching {
 struct Overlay {
   std::vector<double> positions;  ///< (N, 2), of the shared pixels in the target frame
   std::vector<double> source_elevation, target_elevation;  ///< (N), metres
+  std::vector<double> slope;                               ///< (N, 2), of the target along x and y
   double overlap;  ///< intersection over union of the observed areas, 0 to 1
 };
 

@@ -89,7 +89,8 @@ class Aligned {
   Lookup lookup_;
 };
 
-/// Inverse variances times Cauchy's weights of the residuals.
+/// Inverse variances times Cauchy's weights of the residuals, and the slope of weight times residual, by
+/// which a residual that counts less also holds less information.
 void weigh(Linearised& at, const std::vector<double>& variance) {
   const std::size_t count = variance.size();
   std::vector<double> normalised(2 * count);
@@ -98,8 +99,11 @@ void weigh(Linearised& at, const std::vector<double>& variance) {
   std::vector<double> away(normalised);
   for (double& value : away) value = std::abs(value - middle);
   const double half = kCauchy * std::max(kNormal * median(std::move(away)), 1e-12);
-  for (std::size_t i = 0; i < 2 * count; ++i)
-    at.weights[i] = 1.0 / variance[i % count] / (1.0 + std::pow(normalised[i] / half, 2));
+  for (std::size_t i = 0; i < 2 * count; ++i) {
+    const double kept = 1.0 / (1.0 + std::pow(normalised[i] / half, 2));
+    at.weights[i] = kept / variance[i % count];
+    at.slopes[i] = at.weights[i] * std::max(2.0 * kept - 1.0, 0.0);
+  }
 }
 
 std::optional<Linearised> linearise(const Gradients& source, const Gradients& target, const Motion& motion,
@@ -115,8 +119,8 @@ std::optional<Linearised> linearise(const Gradients& source, const Gradients& ta
                 {},
                 std::vector<double>(2 * count),
                 std::vector<double>(2 * count),
-                std::vector<double>(10 * count),
-                std::vector<double>(6 * count)};
+                std::vector<double>(2 * count),
+                std::vector<double>(10 * count)};
   for (std::size_t i = 0; i < count; ++i) {
     const Vector ground = aligned.ground(shared[i * every]);
     at.ground.insert(at.ground.end(), {ground.x(), ground.y()});
@@ -141,9 +145,7 @@ std::optional<Linearised> linearise(const Gradients& source, const Gradients& ta
       const std::size_t row = k * count + i;
       at.residual[row] = residual[k];
       const double by_motion[] = {by_x[k], by_y[k], by_turn[k], k == 0 ? -1.0 : 0.0, k == 1 ? -1.0 : 0.0};
-      const double by_strain[] = {by_x[k] * u, by_y[k] * v, by_x[k] * v + by_y[k] * u};
       std::copy(by_motion, by_motion + 5, &at.by_motion[5 * row]);
-      std::copy(by_strain, by_strain + 3, &at.by_strain[3 * row]);
     }
   }
   weigh(at, variance);

@@ -30,12 +30,6 @@ MatrixXd normal_matrix(const MatrixXd& jacobian, const std::vector<double>& weig
 
 }  // namespace
 
-/// Least-squares parameters and their covariance.
-struct Refinement::Fit {
-  VectorXd parameters;
-  MatrixXd covariance;
-};
-
 std::optional<Refinement> Refinement::of(const GradientMapView& source, const GradientMapView& target,
                                          const Matrix3d& T, const Calibration& calibration,
                                          const Effort& effort) {
@@ -56,29 +50,18 @@ Matrix3d Refinement::T_target_source() const {
 
 MatrixXd Refinement::by_motion() const { return rows(at_.by_motion, 5); }
 
-Refinement::Fit Refinement::fit(const MatrixXd& jacobian) const {
-  const MatrixXd normal = normal_matrix(jacobian, at_.weights);
+Matrix3d Refinement::covariance() const {
+  const MatrixXd jacobian = by_motion();
   const VectorXd weighted = vector(at_.weights).cwiseProduct(vector(at_.residual));
-  const VectorXd parameters =
-      -normal.completeOrthogonalDecomposition().solve(jacobian.transpose() * weighted);
-  const VectorXd remaining = vector(at_.weights).cwiseProduct(vector(at_.residual) + jacobian * parameters);
+  const VectorXd motion = -normal_matrix(jacobian, at_.weights)
+                               .completeOrthogonalDecomposition()
+                               .solve(jacobian.transpose() * weighted);
+  const VectorXd remaining = vector(at_.weights).cwiseProduct(vector(at_.residual) + jacobian * motion);
   const Eigen::Map<const Positions> ground(at_.ground.data(),
                                            static_cast<Eigen::Index>(at_.ground.size() / 2), 2);
-  return {parameters, block_covariance(jacobian, remaining, normal, ground, block_)};
-}
-
-Matrix3d Refinement::covariance() const { return fit(by_motion()).covariance.topLeftCorner<3, 3>(); }
-
-double Refinement::strain_variance() const {
-  MatrixXd jacobian(at_.residual.size(), 8);
-  jacobian << rows(at_.by_motion, 5), rows(at_.by_strain, 3);
-  const Fit fitted = fit(jacobian);
-  const Eigen::Array3d strain = fitted.parameters.tail<3>();
-  const Eigen::Array3d samples =
-      (strain.square() - fitted.covariance.diagonal().tail<3>().array()) / Eigen::Array3d(2.0, 2.0, 1.0);
-  const double prior = std::pow(calibration_.usual_strain, 2), weight = calibration_.usual_strain_samples;
-  if (samples.isNaN().any()) return prior;
-  return (weight * prior + std::max(samples.sum(), 0.0)) / (weight + 3.0);
+  const MatrixXd covariance =
+      block_covariance(jacobian, remaining, normal_matrix(jacobian, at_.slopes), ground, block_);
+  return calibration_.noise_factor * covariance.topLeftCorner<3, 3>();
 }
 
 std::array<Matrix3d, 2> Refinement::weakest(double distance) const {

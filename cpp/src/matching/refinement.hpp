@@ -34,18 +34,12 @@ class Refinement {
   /// Of (x, y, yaw) about the pivot, metres and radians, if the submaps are rigid; NaN if undetermined.
   Matrix3d covariance() const;
 
-  /// Variance of the strain of one submap, dimensionless: how far it is from rigid. From the strain between
-  /// the two, less its noise, and a prior; along x and along y it has twice the variance of one submap's.
-  double strain_variance() const;
-
   /// The two poses at a distance in metres along the direction that is constrained least.
   std::array<Matrix3d, 2> weakest(double distance) const;
 
  private:
-  struct Fit;
   Refinement(refine::Linearised at, double block, const Calibration& calibration)
       : at_(std::move(at)), block_(block), calibration_(calibration) {}
-  Fit fit(const MatrixXd& jacobian) const;
   MatrixXd by_motion() const;
   Matrix3d moved(double dx, double dy, double yaw) const;
 

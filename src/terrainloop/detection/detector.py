@@ -21,6 +21,7 @@ from terrainloop.gp.training import TrainingData, detrend
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.mission_null import MissionNull, by_mission_null, mirrored
+from terrainloop.matching.mission_warp import with_mission_warp
 from terrainloop.matching.register import compare_many
 from terrainloop.record import SubmapRecord
 from terrainloop.resources import check_memory, memory_errors
@@ -188,16 +189,17 @@ class LoopDetector:
     def _by_evidence(
         self, query: MapEntry, stored: Sequence[MapEntry], plausible: NDArray[np.bool_], pairs: Array
     ) -> list[LoopCandidate]:
-        """Compare without the patterns of the sensor, and decide by the null of the mission."""
+        """Compare without the patterns of the sensor; null and warp are those of the mission."""
         patterns = self._patterns
         patterns.add(query)
         source, targets = patterns.cleaned(query), [patterns.cleaned(entry) for entry in stored]
         candidates = compare_many(source, targets, self.settings, pairs=pairs, workers=self.workers)
         null = self._null_with(source, targets, plausible)
-        return [
+        decided = [
             patterns.judge(by_mission_null(candidate, null, self.settings, among), query, target)
             for candidate, among, target in zip(candidates, pairs, stored, strict=True)
         ]
+        return with_mission_warp(decided, self.settings.calibration, earlier=self.loops)
 
     def _null_with(
         self, query: MapEntry, stored: Sequence[MapEntry], plausible: NDArray[np.bool_]

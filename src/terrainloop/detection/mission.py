@@ -30,6 +30,7 @@ from terrainloop.io.files import as_path
 from terrainloop.io.missions import CLOUDS, Mission, load_mission
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.mission_null import MissionNull
+from terrainloop.matching.mission_warp import with_mission_warp
 from terrainloop.record import SubmapRecord
 from terrainloop.resources import available_memory, usable_workers
 from terrainloop.submap import Submap
@@ -194,7 +195,8 @@ def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -
             len(run.entries),
         )
         run = replace(run, complete=False)
-    return tally.of(run)
+    run = tally.of(run)
+    return replace(run, loops=tuple(with_mission_warp(run.loops, run.settings.calibration)))
 
 
 @contextmanager

@@ -130,12 +130,7 @@ class SensorPatterns:
         """A candidate, rejected if a pattern explains it; its reason names what was subtracted."""
         pair = [self._submaps[entry.id] for entry in (source, target)]
         if candidate and (objection := self._objection(candidate, *pair)):
-            candidate = replace(
-                candidate,
-                accepted=False,
-                covariance=np.full((6, 6), np.nan),
-                reason=f"{objection}: {candidate.reason}",
-            )
+            candidate = candidate.rejected(f"{objection}: {candidate.reason}")
         removed = [submap.removed for submap in pair if submap.removed is not None]
         if removed:
             strongest = max(removed, key=lambda pattern: pattern.share)

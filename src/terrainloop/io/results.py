@@ -70,7 +70,7 @@ def iterate_loops(path: str | Path) -> Iterator[LoopCandidate]:
 def loop_to_dict(candidate: LoopCandidate) -> dict[str, Any]:
     """A candidate for JSON, with the parameters of its transform beside the matrix."""
     parameters = parameters_of(candidate.T_target_source).tolist()
-    values = {f.name: getattr(candidate, f.name) for f in fields(candidate)}
+    values = {f.name: getattr(candidate, f.name) for f in fields(candidate) if f.name != "warp"}
     plain = {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
     return plain | {
         "transform": dict(

@@ -27,7 +27,7 @@ def compare_by_inliers(source: MapEntry, target: MapEntry, settings: Settings) -
         alignment = _refined(source, target, alignment, settings)
     overlay = Overlay(source.gradient_map, target.gradient_map, alignment.T_target_source)
     precision = _precision(overlay, alignment, associations)
-    T, covariance = lift_to_se3(overlay, precision, settings.calibration)
+    T, warp = lift_to_se3(overlay, precision, settings.calibration)
     accepted, reason = _decide(alignment, settings)
     inliers = int(alignment.inliers.sum())
     score = inliers * max(0.0, 1.0 - alignment.ssd.ratio)
@@ -35,7 +35,7 @@ def compare_by_inliers(source: MapEntry, target: MapEntry, settings: Settings) -
         source=source.name,
         target=target.name,
         T_target_source=T,
-        covariance=covariance,
+        covariance=warp.rigid,
         inliers=inliers,
         ssd=alignment.ssd.value,
         ssd_ratio=alignment.ssd.ratio,

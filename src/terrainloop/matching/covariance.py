@@ -19,7 +19,7 @@ def block_covariance(
     weighted_residuals : array, (N,) or (C, N)
         Weights times residuals at the optimum.
     normal : array, (P, P)
-        Normal matrix J' W J.
+        Derivative of the gradient J' W r by the parameters: J' W J if the weights are fixed.
     positions : array, (N, 2)
         Where the residuals are, metres.
     block : float
@@ -38,9 +38,12 @@ def block_covariance(
     _, cell = np.unique(cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1], return_inverse=True)
     sums = np.stack([np.bincount(cell, weights=column) for column in gradient.T], axis=1)
     blocks, parameters = sums.shape
+    unknown = np.full((parameters, parameters), np.nan)
+    if blocks <= parameters or np.diag(normal).min() <= 0:
+        return unknown
     scale = np.sqrt(np.diag(normal))
     scales = np.outer(scale, scale)
-    if blocks <= parameters or scale.min() <= 0 or np.linalg.cond(normal / scales) > MAX_CONDITION:
-        return np.full((parameters, parameters), np.nan)
+    if np.linalg.cond(normal / scales) > MAX_CONDITION:
+        return unknown
     inverse = np.linalg.inv(normal / scales) / scales
     return blocks / (blocks - parameters) * inverse @ (sums.T @ sums) @ inverse

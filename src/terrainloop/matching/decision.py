@@ -11,6 +11,7 @@ from terrainloop.loop import NO_EVIDENCE, LoopCandidate
 from terrainloop.matching.correspondences import associate
 from terrainloop.matching.hypotheses import Hypothesis, Pair, propose_hypotheses
 from terrainloop.matching.lift import PlanarPrecision, lift_to_se3
+from terrainloop.matching.mission_warp import warp_variance
 from terrainloop.matching.overlay import Overlay
 from terrainloop.matching.query import Query
 from terrainloop.matching.ransac import get_inliers, inlier_radius_of
@@ -156,14 +157,14 @@ def _candidate(pair: Pair, weighed: Weighed, refinement: Refinement | None, obje
     else:
         T = refinement.T_target_source
         overlay = Overlay(*pair.maps, T)
-        precision = PlanarPrecision(refinement.pivot, refinement.covariance, refinement.strain_variance)
-    T_target_source, covariance = lift_to_se3(overlay, precision, calibration)
+        precision = PlanarPrecision(refinement.pivot, refinement.covariance)
+    T_target_source, warp = lift_to_se3(overlay, precision, calibration)
     ssd, inliers = compute_ssd(overlay), _inliers(pair, T) if refinement else 0
     return LoopCandidate(
         source=pair.source.name,
         target=pair.target.name,
         T_target_source=T_target_source,
-        covariance=covariance,
+        covariance=warp.covariance(warp_variance([warp], calibration)),
         inliers=inliers,
         ssd=ssd.value,
         ssd_ratio=ssd.ratio,
@@ -177,6 +178,7 @@ def _candidate(pair: Pair, weighed: Weighed, refinement: Refinement | None, obje
         inlier_score=inliers * max(0.0, 1.0 - ssd.ratio),
         source_origin=pair.source.gradient_map.local_origin,
         target_origin=pair.target.gradient_map.local_origin,
+        warp=None if refinement is None else warp,
     )
 
 

@@ -107,11 +107,7 @@ def by_mission_null(
     if explained:
         objection = "chance explains it, as mirror images show"
     fit = rest.partition(" allowed; ")[2]
-    return replace(
-        candidate,
-        log_nfa=log_nfa,
-        score=candidate.score if candidate.score == NO_EVIDENCE else -log_nfa,
-        accepted=candidate.accepted and not explained,
-        covariance=np.full((6, 6), np.nan) if explained else candidate.covariance,
-        reason=reason_in_words(objection, log_nfa + np.log10(pairs), allowed, fit),
-    )
+    reason = reason_in_words(objection, log_nfa + np.log10(pairs), allowed, fit)
+    score = candidate.score if candidate.score == NO_EVIDENCE else -log_nfa
+    decided = replace(candidate, log_nfa=log_nfa, score=score, reason=reason)
+    return decided.rejected(reason) if explained else decided

@@ -51,12 +51,11 @@ class Refinement:
         Centroid of the sample points in the target frame, metres.
     positions : array, (N, 2)
         Sample points in the target frame, metres.
-    residual, weights : array, (2, N)
-        Residuals of the two components of the gradient, and their weights.
+    residual, weights, slopes : array, (2, N)
+        Residuals of the two components of the gradient, their weights, and the derivatives of weights times
+        residuals by the residuals; zero where a larger residual counts less.
     motion : array, (2, N, 5)
         Jacobian of the residual by x, y, yaw about the pivot, and the difference in slope along x and y.
-    strain : array, (2, N, 3)
-        Jacobian of the residual by the strain (non-rigid deformation) along x, along y, and the shear.
     length_scale : float
         Metres.
     calibration : Calibration
@@ -67,30 +66,24 @@ class Refinement:
     positions: Array
     residual: Array
     weights: Array
+    slopes: Array
     motion: Array
-    strain: Array
     length_scale: float
     calibration: Calibration
 
     @cached_property
     def covariance(self) -> Array:
-        """(3, 3) of (x, y, yaw) about the pivot, metres and radians, if the submaps are rigid."""
-        return self._fit(self.motion)[1][:3, :3]
+        """(3, 3) of (x, y, yaw) about the pivot, metres and radians, if the submaps are rigid.
 
-    @cached_property
-    def strain_variance(self) -> float:
-        """Variance of the strain of one submap, dimensionless: how far it is from rigid.
-
-        Estimated from the strain between the two submaps, less its noise, and a prior. The strain along x and
-        along y has twice the variance of one submap's, the shear the same variance.
+        The information is that of the slopes of Cauchy's influence function, not of its weights, as for every
+        M-estimator (P. J. Huber, Robust Statistics, 1981, chapter 7).
         """
-        strain, covariance = self._fit(np.concatenate([self.motion, self.strain], axis=-1))
-        samples = (strain[5:] ** 2 - np.diag(covariance)[5:]) / (2.0, 2.0, 1.0)
-        prior, weight = self.calibration.usual_strain**2, self.calibration.usual_strain_samples
-        if np.isnan(samples).any():
-            return prior
-        observed = max(float(samples.sum()), 0.0)
-        return (weight * prior + observed) / (weight + len(samples))
+        flat = self.motion.reshape(-1, self.motion.shape[-1])
+        normal = (flat * self.slopes.reshape(-1, 1)).T @ flat
+        remaining = self.weights * (self.residual + self.motion @ self._solve(self.motion)[0])
+        block = self.calibration.block * self.length_scale
+        covariance = block_covariance(self.motion, remaining, normal, self.positions, block)
+        return self.calibration.noise_factor * covariance[:3, :3]
 
     def weakest(self, distance: float) -> tuple[Array, Array]:
         """The two poses (3, 3) at a distance, in metres, along the least constrained direction."""
@@ -112,13 +105,6 @@ class Refinement:
         normal = weighted.T @ flat
         fitted = np.linalg.lstsq(normal, weighted.T @ self.residual.ravel(), rcond=None)[0]
         return np.asarray(-fitted, dtype=float), normal
-
-    def _fit(self, jacobian: Array) -> tuple[Array, Array]:
-        """Least-squares parameters (P,) and their covariance (P, P)."""
-        parameters, normal = self._solve(jacobian)
-        remaining = self.weights * (self.residual + jacobian @ parameters)
-        block = self.calibration.block * self.length_scale
-        return parameters, block_covariance(jacobian, remaining, normal, self.positions, block)
 
 
 def refine(
