@@ -122,12 +122,12 @@ TEST(HostileMaps, DegenerateMasksAreDecided) {
 TEST(HostileMaps, ImpossibleSettingsAreRefused) {
   const auto same = [](GradientMap&) {};
   for (double Calibration::* number :
-       {&Calibration::pixels_per_length_scale, &Calibration::blur, &Calibration::spectrum_smoothing,
-        &Calibration::whitening_floor, &Calibration::clip, &Calibration::rotation_step,
-        &Calibration::min_shared_area, &Calibration::min_separation, &Calibration::peak_threshold,
-        &Calibration::wraparound, &Calibration::tail, &Calibration::independent_tests,
-        &Calibration::max_correlation, &Calibration::ambiguity_ratio, &Calibration::ambiguity_chance,
-        &Calibration::block, &Calibration::usual_strain_samples})
+       {&Calibration::pixels_per_length_scale, &Calibration::blur, &Calibration::local_mean,
+        &Calibration::spectrum_smoothing, &Calibration::whitening_floor, &Calibration::clip,
+        &Calibration::rotation_step, &Calibration::min_shared_area, &Calibration::min_separation,
+        &Calibration::peak_threshold, &Calibration::wraparound, &Calibration::tail,
+        &Calibration::independent_tests, &Calibration::max_correlation, &Calibration::ambiguity_ratio,
+        &Calibration::ambiguity_chance, &Calibration::block, &Calibration::usual_strain_samples})
     for (const double bad : {kNan, kInf, 0.0, -1.0}) {
       MatchSettings settings;
       settings.calibration.*number = bad;
@@ -147,11 +147,12 @@ TEST(HostileMaps, ImpossibleSettingsAreRefused) {
 
 TEST(HostileMaps, ExtremeSettingsHaveAnAnswer) {
   for (double Calibration::* number :
-       {&Calibration::pixels_per_length_scale, &Calibration::blur, &Calibration::spectrum_smoothing,
-        &Calibration::whitening_floor, &Calibration::clip, &Calibration::rotation_step,
-        &Calibration::min_shared_area, &Calibration::min_separation, &Calibration::peak_threshold,
-        &Calibration::tail, &Calibration::independent_tests, &Calibration::ambiguity_ratio,
-        &Calibration::ambiguity_chance, &Calibration::block, &Calibration::usual_strain_samples})
+       {&Calibration::pixels_per_length_scale, &Calibration::blur, &Calibration::local_mean,
+        &Calibration::spectrum_smoothing, &Calibration::whitening_floor, &Calibration::clip,
+        &Calibration::rotation_step, &Calibration::min_shared_area, &Calibration::min_separation,
+        &Calibration::peak_threshold, &Calibration::tail, &Calibration::independent_tests,
+        &Calibration::ambiguity_ratio, &Calibration::ambiguity_chance, &Calibration::block,
+        &Calibration::usual_strain_samples})
     for (const double odd : {kTiny, 1e-6, 1e-3, 1e6, kHuge}) {
       MatchSettings settings;
       settings.calibration.*number = odd;

@@ -75,10 +75,10 @@ void check_map(const GradientMapView& map, const char* name) {
 void check_settings(const MatchSettings& settings) {
   const Calibration& c = settings.calibration;
   require(positive({settings.pairs, settings.max_false_loops}), "pairs and max_false_loops must be positive");
-  require(sensible({c.pixels_per_length_scale, c.blur, c.spectrum_smoothing, c.whitening_floor, c.clip,
-                    c.rotation_step, c.min_shared_area, c.min_separation, c.peak_threshold, c.wraparound,
-                    c.tail, c.independent_tests, c.max_correlation, c.ambiguity_ratio, c.ambiguity_chance,
-                    c.block, c.usual_strain_samples},
+  require(sensible({c.pixels_per_length_scale, c.blur, c.local_mean, c.spectrum_smoothing, c.whitening_floor,
+                    c.clip, c.rotation_step, c.min_shared_area, c.min_separation, c.peak_threshold,
+                    c.wraparound, c.tail, c.independent_tests, c.max_correlation, c.ambiguity_ratio,
+                    c.ambiguity_chance, c.block, c.usual_strain_samples},
                    1e-6),
           "the numbers of the calibration must be within 1e-6 and 1e6");
   require(sensible({c.min_correlation, c.usual_strain, c.motion_by_strain[0], c.motion_by_strain[1],
