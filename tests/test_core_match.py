@@ -150,7 +150,10 @@ REJECTED = {
         WORLD.map(origin=(-1.9, -1.9), shape=(48, 47)),
         map_of(twice, origin=(-2.0, -2.0), shape=(50, 100)),
     ),
-    "the match slides": (map_of(ridges(1), se2(0.4, -0.3, 0.7)), map_of(ridges(1))),
+    "the match slides": (
+        map_of(ridges(1), se2(0.4, -0.3, 0.7), shape=(70, 70)),
+        map_of(ridges(1), shape=(70, 70)),
+    ),
     "too little ground to determine": (map_of(ridges(1)), map_of(ridges(1))),
 }
 
@@ -177,6 +180,7 @@ def test_rejections_are_those_of_python(word, pair):
         ("", {"usual_strain": 0.02, "motion_by_strain": (1.0, 3.0, 2.0)}),
         ("", {"rotation_by_strain": (0.1, 2.0, 1.0), "usual_strain_samples": 9.0}),
         ("", {"clip": 0.5, "blur": 0.6, "whitening_floor": 0.1, "spectrum_smoothing": 2.5}),
+        ("", {"local_mean": 1.5}),
         ("", {"pixels_per_length_scale": 1.5, "rotation_step": 0.7, "wraparound": 1.0}),
         ("", {"max_pixels": 20, "candidates": 3, "peak_threshold": 3.0}),
         ("", {"tail": 0.5, "independent_tests": 2.0, "max_correlation": 0.9}),

@@ -20,6 +20,7 @@ from terrainloop.gradient_map import GradientMap
 
 RAYLEIGH_MEDIAN = float(np.sqrt(2 * np.log(2)))  # median length of a vector of two standard normal components
 TINY = float(np.finfo(np.float32).tiny)
+ROUNDING = 1e-5  # of the largest value: what a subtraction in single precision leaves of level ground
 
 Image = NDArray[np.float32]
 
@@ -153,9 +154,9 @@ def _about_local_mean(weighted: Image, weight: Image, calibration: Calibration) 
     def around(image: Image) -> NDArray[Any]:
         return cv2.GaussianBlur(image, (0, 0), calibration.local_mean, borderType=cv2.BORDER_CONSTANT)
 
-    return np.asarray(
-        weighted - weight * around(weighted) / np.maximum(around(weight), TINY), dtype=np.float32
-    )
+    rest = weighted - weight * around(weighted) / np.maximum(around(weight), TINY)
+    rest[np.abs(rest) < ROUNDING * np.abs(weighted).max()] = 0.0
+    return np.asarray(rest, dtype=np.float32)
 
 
 def _whitened(x: Image, y: Image, valid: Image, calibration: Calibration) -> tuple[Image, Image]:

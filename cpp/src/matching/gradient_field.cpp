@@ -10,6 +10,7 @@ namespace terrainloop::matching {
 namespace {
 
 constexpr float kTiny = std::numeric_limits<float>::min();
+constexpr float kRounding = 1e-5f;  // of the largest value: what a subtraction leaves of level ground
 
 /// Weights of consecutive pixels of a line.
 struct Taps {
@@ -101,8 +102,12 @@ void subtract_local_mean(Field& field, const std::vector<float>& known, const Ca
   const std::vector<float> total = around(known);
   for (std::vector<float>* component : {&field.x, &field.y}) {
     const std::vector<float> sum = around(*component);
-    for (std::size_t i = 0; i < sum.size(); ++i)
-      (*component)[i] -= known[i] * sum[i] / std::max(total[i], kTiny);
+    float largest = 0.0f;
+    for (const float value : *component) largest = std::max(largest, std::abs(value));
+    for (std::size_t i = 0; i < sum.size(); ++i) {
+      const float rest = (*component)[i] - known[i] * sum[i] / std::max(total[i], kTiny);
+      (*component)[i] = std::abs(rest) < kRounding * largest ? 0.0f : rest;
+    }
   }
 }
 

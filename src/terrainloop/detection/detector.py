@@ -132,7 +132,7 @@ class LoopDetector:
                 query = replace(query, record=replace(query.record, name=name))
             loops = self._add(query)
             if self.settings.map.fit == "database":
-                self.parameters = query.gradient_map.parameters
+                self.parameters = self.parameters or query.gradient_map.parameters
             return loops
 
     def add_entry(self, query: MapEntry) -> list[LoopCandidate]:
