@@ -216,6 +216,7 @@ MUTANTS = [
     ("weak revisits", "pixels_per_length_scale", 1.0),
     ("weak revisits", "max_pixels", 24),
     ("weak revisits", "blur", 1.2),
+    ("weak revisits", "local_mean", 0.3),
     ("weak revisits", "spectrum_smoothing", 6.0),
     ("weak revisits", "whitening_floor", 100.0),
     ("weak revisits", "clip", 100.0),

@@ -116,8 +116,9 @@ def test_a_database_shares_its_hyperparameters(submaps, strict):
     detector = LoopDetector(strict)
     for name in ("000000", "000001"):
         detector.add(submaps[name])
-    used = [stored.gradient_map.parameters for stored in detector.entries.values()]
-    assert used == [detector.parameters] * 2
+    first, second = (stored.gradient_map.parameters for stored in detector.entries.values())
+    assert first == detector.parameters
+    assert replace(second, noise=first.noise) == first
     assert detector.parameters == fit_database([submaps["000000"]], strict)
     # What the clouds were made with, and near what the world is made of.
     assert detector.parameters.noise == pytest.approx(0.01, rel=0.3)
@@ -127,7 +128,26 @@ def test_a_database_shares_its_hyperparameters(submaps, strict):
 def test_known_hyperparameters_are_used(submaps, strict):
     detector = LoopDetector(strict, parameters=PARAMETERS)
     detector.add(submaps["000001"])
-    assert detector.entries["000001"].gradient_map.parameters == PARAMETERS
+    used = detector.entries["000001"].gradient_map.parameters
+    assert (used.length_scale, used.variance) == (PARAMETERS.length_scale, PARAMETERS.variance)
+    assert detector.parameters == PARAMETERS
+
+
+def test_each_submap_of_a_database_has_its_own_noise(submaps, strict):
+    """The second as another sensor would have seen it, with errors four times as large."""
+    cloud = submaps["000001"].points.copy()
+    cloud[:, 2] += np.random.default_rng(0).normal(0, 0.04, len(cloud))
+    detector = LoopDetector(strict)
+    for submap in (submaps["000000"], Submap(cloud, name="rough")):
+        detector.add(submap)
+    first, second = (stored.gradient_map.parameters for stored in detector.entries.values())
+    assert second.noise == pytest.approx(np.hypot(first.noise, 0.04), rel=0.15)
+    assert replace(second, noise=first.noise) == first
+
+
+def test_fixed_hyperparameters_of_every_submap_are_used_as_they_are(submaps, strict):
+    known = map_submap(submaps["000001"], per_submap(strict), PARAMETERS)
+    assert known.gradient_map.parameters == PARAMETERS
 
 
 def test_per_submap_fit_gives_each_its_own(submaps, strict):
@@ -237,10 +257,12 @@ def test_mission_goes_on_past_a_broken_cloud(detected, true_loop):
     assert_pose(run.loops[0], true_loop)
 
 
-def test_mission_maps_share_their_hyperparameters(detected):
+def test_mission_maps_share_their_hyperparameters_but_not_the_noise(detected):
     run, _ = detected
-    used = {stored.gradient_map.parameters for stored in run.entries.values()}
-    assert used == {run.parameters}
+    used = [stored.gradient_map.parameters for stored in run.entries.values()]
+    assert {replace(each, noise=run.parameters.noise) for each in used} == {run.parameters}
+    assert len(set(used)) == len(used)
+    assert [each.noise for each in used] == pytest.approx([run.parameters.noise] * len(used), rel=0.2)
 
 
 def test_mission_reports_its_progress(detected):

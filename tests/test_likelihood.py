@@ -1,13 +1,17 @@
 """Hyperparameters from every point: the likelihood of blocks, and the fit by it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from terrainloop import _core
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.hyperparameters import (
+    FitOptions,
     fit_blocks,
     fit_hyperparameters,
+    fit_noise,
     maximise_likelihood,
     negative_log_likelihood,
 )
@@ -140,6 +144,26 @@ def test_fixed_hyperparameters_stay(surface, fixed):
     fitted = fit_blocks([surface], start, fixed=fixed)
     for name in ("length_scale", "variance", "noise"):
         assert (getattr(fitted, name) == pytest.approx(getattr(start, name), rel=1e-9)) == (name in fixed)
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.02, 0.2])
+def test_the_noise_of_a_cloud_is_found_whatever_that_of_the_database(noise):
+    cloud = draw(3000, 3.0, replace(TRUTH, noise=noise))
+    fitted = fit_noise(cloud, TRUTH, FitOptions())
+    assert fitted.noise == pytest.approx(noise, rel=0.1)
+    assert replace(fitted, noise=TRUTH.noise) == TRUTH
+
+
+def test_the_noise_of_a_few_drawn_points_is_that_of_all():
+    cloud = draw(6000, 4.0)
+    few, many = (fit_noise(cloud, TRUTH, FitOptions(count)).noise for count in (2000, None))
+    assert few == pytest.approx(many, rel=0.15)
+
+
+def test_ground_without_any_scatter_keeps_a_noise_that_can_be_solved():
+    rng = np.random.default_rng(0)
+    flat = detrend(np.c_[rng.uniform(0, 5, (2000, 2)), np.zeros(2000)])
+    assert fit_noise(flat, TRUTH, FitOptions()).noise == pytest.approx(1e-4 * TRUTH.variance**0.5, rel=0.1)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])

@@ -69,7 +69,9 @@ class MapSettings(_Frozen):
         True, description="scale each point's noise by the scatter and the number of the points around it"
     )
     fit: Literal["database", "submap"] = Field(
-        "database", description="maximise the likelihood once (maps stay comparable) or for every submap"
+        "database",
+        description="database: length scale and variance in common, noise each cloud's own; "
+        "submap: all of them for every submap",
     )
     resolution: float | None = Field(
         None, ge=1e-5, le=1e4, description="grid spacing, m per pixel; null: a sixth of the length scale"
@@ -131,6 +133,9 @@ class Calibration(_Frozen):
     pixels_per_length_scale: float = Field(2.0, gt=0, description="field: pixels per length scale")
     max_pixels: int = Field(96, ge=8, description="field: pixels across; larger maps take twice the spacing")
     blur: float = Field(0.4, gt=0, description="field: standard deviation of the low-pass filter, pixels")
+    local_mean: float = Field(
+        4.0, gt=0, description="field: standard deviation of the window of the local mean, pixels"
+    )
     spectrum_smoothing: float = Field(
         1.5, gt=0, description="field: smoothing of the power spectrum, cycles per width"
     )

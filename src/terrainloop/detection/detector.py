@@ -15,7 +15,7 @@ from terrainloop.detection.sensor_pattern import SensorPatterns
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import Array
-from terrainloop.gp.hyperparameters import fit_hyperparameters
+from terrainloop.gp.hyperparameters import FitOptions, fit_hyperparameters, fit_noise
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.gp.training import TrainingData, detrend
 from terrainloop.gradient_map import GradientMap
@@ -47,7 +47,8 @@ class LoopDetector:
     max_false_loops : float, optional
         Expected number of false loop closures per mission; overrides the settings.
     parameters : Hyperparameters, optional
-        Hyperparameters of the Gaussian process, if known; otherwise fitted according to ``settings.map.fit``.
+        Hyperparameters of the Gaussian process, if known; otherwise fitted according to ``settings.map.fit``,
+        with "database" to the first submap. Each map has a noise of its own (see `map_submap`).
     expected_pairs : int, optional
         Number of pairs that the mission will compare, if known: `max_false_loops` is shared among them.
         Otherwise later queries are given less of it, so that it holds for any number (see `allowance`).
@@ -154,7 +155,7 @@ class LoopDetector:
                 query = replace(query, record=replace(query.record, name=name))
             loops = self._add(query)
             if self.settings.map.fit == "database":
-                self.parameters = query.gradient_map.parameters
+                self.parameters = self.parameters or query.gradient_map.parameters
             return loops
 
     def add_entry(self, query: MapEntry) -> list[LoopCandidate]:
@@ -274,18 +275,34 @@ def sample_null(
 def fit_database(
     clouds: Sequence[Submap | TrainingData], settings: Settings, *, workers: int = 1
 ) -> Hyperparameters:
-    """Hyperparameters for all maps of a database, so that they are comparable."""
-    limits = [n for n in (settings.map.max_points, settings.map.fit_points) if n is not None]
+    """Length scale and variance for all maps of a database, so that they are comparable; a typical noise."""
     return fit_hyperparameters(
         clouds,
         length_scale=settings.map.length_scale,
         noise=settings.map.noise,
-        max_points=min(limits, default=None),
+        max_points=_fit_points(settings),
         exact=settings.map.solver == "exact",
         remove_plane=settings.map.remove_plane,
         seed=settings.seed,
         workers=workers,
     )
+
+
+def _with_own_noise(
+    data: TrainingData, shared: Hyperparameters, settings: Settings, workers: int
+) -> Hyperparameters:
+    options = FitOptions(
+        _fit_points(settings),
+        remove_plane=settings.map.remove_plane,
+        seed=settings.seed,
+        workers=workers,
+    )
+    return fit_noise(data, shared, options)
+
+
+def _fit_points(settings: Settings) -> int | None:
+    limits = [n for n in (settings.map.max_points, settings.map.fit_points) if n is not None]
+    return min(limits, default=None)
 
 
 def detrend_submap(submap: Submap, settings: Settings) -> TrainingData:
@@ -310,7 +327,8 @@ def map_submap(
     submap : Submap
     settings : Settings
     parameters : Hyperparameters, optional
-        Hyperparameters of the database; fitted to this submap if not given.
+        Hyperparameters of the database; fitted to this submap if not given. Where ``settings.map.fit`` is
+        "database", the submap's own noise takes the place of theirs.
     data : TrainingData, optional
         Result of `detrend_submap`, if known.
     odometry : array, (4, 4), optional
@@ -326,7 +344,10 @@ def map_submap(
         If no map can be made, or there is not enough memory.
     """
     data = data or detrend_submap(submap, settings)
-    parameters = parameters or fit_database([data], settings, workers=workers)
+    if parameters is None:
+        parameters = fit_database([data], settings, workers=workers)
+    elif settings.map.fit == "database":
+        parameters = _with_own_noise(data, parameters, settings, workers)
     gradient_map = GradientMap.from_points(
         data,
         parameters.length_scale,
@@ -353,7 +374,7 @@ def map_submap(
 def map_pair(
     source: Submap, target: Submap, settings: Settings, *, workers: int = 1
 ) -> tuple[MapEntry, MapEntry]:
-    """Two submaps mapped with the same hyperparameters, so that they can be compared."""
+    """Two submaps mapped with one length scale and variance, so that they can be compared."""
     data = [detrend_submap(submap, settings) for submap in (source, target)]
     shared = fit_database(data, settings, workers=workers) if settings.map.fit == "database" else None
     return (

@@ -32,6 +32,7 @@ MIN_PATCH = 10.0  # length scales along the side of a patch: a plane subtracted 
 # Stages of a search: side of the blocks in length scales, and the sum of r^3 over their ranks r. The first
 # finds about where the length scale is; the larger the blocks, the nearer to the likelihood of all points.
 BLOCK_STAGES = ((4.0, 3e7), (10.0, 1e9))
+NOISE_STAGES = ((4.0, 3e7),)  # where the length scale is known
 MAX_ROUNDS = 6
 TRUST_REGION = (1 / 1.5, 3.0)  # factors of the length scale that blocks are good for
 CONVERGED_FACTOR = 1.25  # of the length scale, within which they are at their best
@@ -169,6 +170,39 @@ def fit_training_data(
         side *= 2
 
 
+def fit_noise(cloud: TrainingData, shared: Hyperparameters, options: FitOptions) -> Hyperparameters:
+    """The hyperparameters of a database, with the noise that makes one of its clouds most likely.
+
+    Sensors, densities and epochs differ in their errors, the ground in its length scale and variance: these
+    stay those of the database, so that its maps remain comparable.
+
+    Parameters
+    ----------
+    cloud : TrainingData
+    shared : Hyperparameters
+        Of the database; its noise is not used.
+    options : FitOptions
+        ``exact`` has no effect: one noise is as well known from small blocks.
+
+    Returns
+    -------
+    Hyperparameters
+        ``.noise`` is that of the cloud (m), at least 1e-4 of the prior's standard deviation.
+    """
+    side = max(PATCH_SIDE, MIN_PATCH * shared.length_scale)
+    drawn = _drawn(cloud.patches(side, remove_plane=options.remove_plane), options)
+    start = _typical(drawn).start(shared.length_scale, shared.variance, None)
+    with core_errors("a fit of the noise"):
+        fitted = fit_blocks(
+            drawn,
+            start,
+            fixed=("length_scale", "variance"),
+            workers=options.workers,
+            stages=NOISE_STAGES,
+        )
+    return replace(shared, noise=fitted.noise)
+
+
 def _fit_patches(
     patches: Sequence[Sequence[TrainingData]],
     given: Mapping[str, float | None],
@@ -209,7 +243,12 @@ def _typical(patches: Sequence[TrainingData]) -> TrainingData:
 
 
 def fit_blocks(
-    data: Sequence[TrainingData], start: Hyperparameters, *, fixed: Sequence[str] = (), workers: int = 1
+    data: Sequence[TrainingData],
+    start: Hyperparameters,
+    *,
+    fixed: Sequence[str] = (),
+    workers: int = 1,
+    stages: Sequence[tuple[float, float]] = BLOCK_STAGES,
 ) -> Hyperparameters:
     """Most likely hyperparameters from every point, square blocks of ground being taken as independent.
 
@@ -227,13 +266,15 @@ def fit_blocks(
         Names of the hyperparameters that keep their value.
     workers : int
         Threads; the result does not depend on it.
+    stages : sequence of (float, float)
+        Side of the blocks and work, as in `BLOCK_STAGES`, of each search.
     """
     arrays = [(each.xy, each.elevation, each.relative_noise) for each in data]
     low, high = _bounds(start, fixed)
     if "length_scale" not in fixed:
         high[0] = max(high[0], np.log(max(np.ptp(each.xy, axis=0).max() for each in data)))
     log_parameters = np.log(astuple(start))
-    for side, work in BLOCK_STAGES:
+    for side, work in stages:
         for _ in range(MAX_ROUNDS):
             begin = log_parameters
             length_scale, variance, noise = np.exp(begin).tolist()
