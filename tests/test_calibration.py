@@ -210,7 +210,6 @@ MUTANTS = [
     ("unrelated", "tail", 0.7),
     ("unrelated", "independent_tests", 0.5),
     ("small maps", "independent_tests", 0.005),
-    ("revisits", "ambiguity_chance", 1e9),
     ("revisits", "dense_hypotheses", 0),
     ("revisits", "block", 6.0),
     ("weak revisits", "pixels_per_length_scale", 1.0),
