@@ -107,7 +107,7 @@ def with_common_trace(*seeds):
 
 def crest():
     """A straight crest on maps so small that a rival is no surprise by itself."""
-    options = {"origin": (-2.5, -2.5), "shape": (62, 62)}
+    options = {"origin": (-2.5, -2.5), "shape": (68, 68)}
     return map_of(ridges(4), TURNED, **options), map_of(ridges(4), **options)
 
 

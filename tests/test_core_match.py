@@ -162,7 +162,7 @@ REJECTED = {
         WORLD.map(origin=(-1.9, -1.9), shape=(48, 47)),
         map_of(twice, origin=(-2.0, -2.0), shape=(50, 100)),
     ),
-    "ambiguous ": (map_of(ridges(1), se2(0.4, -0.3, 0.7)), map_of(ridges(1))),
+    "ambiguous ": (map_of(ridges(1), T, **BIG), map_of(ridges(1), **BIG)),
     "undetermined in yaw": (map_of(rings, T, **BIG), map_of(rings, **BIG)),
     "the match slides": (map_of(long_crests, T, **BIG), map_of(long_crests, **BIG)),
     "too little ground to determine": (map_of(ridges(1)), map_of(ridges(1))),
