@@ -8,12 +8,12 @@ from calibration_util import calibrated
 from conftest import PARAMETERS, map_of
 
 from terrainloop.config import Calibration, Settings
-from terrainloop.detection.detector import LoopDetector, map_submap, null_scores, sample_null
+from terrainloop.detection.detector import LoopDetector, map_submap, mirror_scores, sample_null
 from terrainloop.entry import MapEntry
 from terrainloop.geometry import se2, transform
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import NO_EVIDENCE, LoopCandidate
-from terrainloop.matching.mission_null import MissionNull, by_mission_null, mirrored
+from terrainloop.matching.mission_null import MissionNull, by_mission_null, mirrored, without_loops
 from terrainloop.record import SubmapRecord
 from terrainloop.submap import Submap
 
@@ -93,7 +93,7 @@ def test_the_mirror_image_of_the_mirror_image_is_the_submap(world, strict):
 
 def test_a_mirror_image_does_not_match_its_submap(world, strict):
     entry = map_submap(Submap(world(5).observe(np.eye(4), (0.1, -0.2), seed=0)), strict, PARAMETERS)
-    (score,) = null_scores(entry, [entry], strict)
+    (score,) = mirror_scores(entry, [entry], strict)
     assert score < 2.0
 
 
@@ -205,6 +205,29 @@ def test_the_sample_is_spread_over_the_pairs_of_the_mission(alike):
     assert len(sample_null(alike, settings)) == 20
     assert len(sample_null(alike[: settings.skip_recent + 1], settings)) == 0
     assert len(sample_null([], settings)) == 0
+
+
+def test_mirror_images_of_loops_are_not_in_the_null(candidate):
+    """Strong loops are found by any null and leave it; then weaker ones are found."""
+    rng = np.random.default_rng(4)
+    ordinary = -np.log10(rng.exponential(size=100))
+    own = [40.0] * 30 + [5.5] + [0.2] * 99
+    candidates = [replace(candidate, log_nfa=-score, score=score, accepted=score > 5) for score in own]
+    scores = np.r_[rng.uniform(1, 6, 30), ordinary]
+    scores[60] = np.nan
+    kept = without_loops(scores, candidates, Settings(), 130)
+    assert sorted(kept) == sorted(score for score in np.delete(ordinary, [0, 30]))
+    weak = candidates[30]
+    assert not by_mission_null(
+        weak, MissionNull.of(scores[~np.isnan(scores)], Calibration()), Settings(), 130
+    )
+    assert by_mission_null(weak, MissionNull.of(kept, Calibration()), Settings(), 130)
+
+
+def test_where_nothing_is_a_loop_all_mirror_images_are_in_the_null(candidate):
+    rejected = [replace(candidate, accepted=False)] * 3
+    assert without_loops(np.array([1.0, np.nan, 7.0]), rejected, Settings(), 3) == [1.0, 7.0]
+    assert without_loops(np.empty(0), [], Settings(), 0) == []
 
 
 def estimates(calibration, *, count, heavy=0.25, score=6.0):

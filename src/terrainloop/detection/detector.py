@@ -7,7 +7,6 @@ from numbers import Real
 from threading import Lock
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrainloop.config import Settings
 from terrainloop.detection.allowance import pairs_equivalent, plausible_by_odometry, share_of_query
@@ -20,7 +19,7 @@ from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.gp.training import TrainingData, detrend
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
-from terrainloop.matching.mission_null import MissionNull, by_mission_null, mirrored
+from terrainloop.matching.mission_null import MissionNull, by_mission_null, mirrored, without_loops
 from terrainloop.matching.mission_warp import with_mission_warp
 from terrainloop.matching.register import compare_many
 from terrainloop.record import SubmapRecord
@@ -32,7 +31,6 @@ logger = logging.getLogger(__name__)
 FEATURE_BYTES_PER_PIXEL = 250  # of SIFT, at the peak (docs/solver.md)
 
 NULL_PAIRS_PER_QUERY = 12  # mirror images compared for one submap, at most
-ENOUGH_APART = 100  # pairs that odometry puts apart, to measure the null on them alone
 NEVER_SIGNIFICANT = 1e100  # pairs; mirror images need no thorough refinement
 
 PairSink = Callable[[LoopCandidate], object]
@@ -172,12 +170,11 @@ class LoopDetector:
                 mend="name each submap differently",
             )
         stored = list(self.entries.values())[: max(0, len(self.entries) - self.settings.skip_recent)]
-        plausible = plausible_by_odometry(query, stored, list(self.entries.values())[len(stored) :])
-        known = self.expected_pairs
+        known, since = self.expected_pairs, list(self.entries.values())[len(stored) :]
         share = len(stored) / known if known else share_of_query(max(len(stored), 1))
-        pairs = pairs_equivalent(share, plausible)
+        pairs = pairs_equivalent(share, plausible_by_odometry(query, stored, since))
         if self.settings.match.decision == "evidence":
-            candidates = self._by_evidence(query, stored, plausible, pairs)
+            candidates = self._by_evidence(query, stored, pairs)
         else:
             candidates = compare_many(query, stored, self.settings, pairs=pairs, workers=self.workers)
         self.entries[query.id] = query
@@ -187,31 +184,29 @@ class LoopDetector:
         self.loops += loops
         return loops
 
-    def _by_evidence(
-        self, query: MapEntry, stored: Sequence[MapEntry], plausible: NDArray[np.bool_], pairs: Array
-    ) -> list[LoopCandidate]:
+    def _by_evidence(self, query: MapEntry, stored: Sequence[MapEntry], pairs: Array) -> list[LoopCandidate]:
         """Compare without the patterns of the sensor; null and warp are those of the mission."""
         patterns = self._patterns
         patterns.add(query)
         source, targets = patterns.cleaned(query), [patterns.cleaned(entry) for entry in stored]
         candidates = compare_many(source, targets, self.settings, pairs=pairs, workers=self.workers)
-        null = self._null_with(source, targets, plausible)
+        mirrors = self._mirror_images(source, targets)
+        null = MissionNull.of([*self.null_scores, *mirrors.values()], self.settings.calibration)
         decided = [
             patterns.judge(by_mission_null(candidate, null, self.settings, among), query, target)
             for candidate, among, target in zip(candidates, pairs, stored, strict=True)
         ]
+        self.null_scores += [score for index, score in mirrors.items() if not decided[index]]
         return with_mission_warp(decided, self.settings.calibration, earlier=self.loops)
 
-    def _null_with(
-        self, query: MapEntry, stored: Sequence[MapEntry], plausible: NDArray[np.bool_]
-    ) -> MissionNull:
-        """The null of the mission so far; a query adds to it while it is not well known."""
+    def _mirror_images(self, query: MapEntry, stored: Sequence[MapEntry]) -> dict[int, float]:
+        """Scores of the mirror image of a query against some stored submaps, while the null is not known."""
         wanted = 0 if self._null_is_known else self.settings.calibration.null_pairs
-        if len(self.null_scores) < wanted and stored:
-            sample = [entry for entry, near in zip(stored, plausible, strict=True) if not near] or stored
-            sample = sample[:: -(-len(sample) // NULL_PAIRS_PER_QUERY)]
-            self.null_scores += null_scores(query, sample, self.settings, workers=self.workers)
-        return MissionNull.of(self.null_scores, self.settings.calibration)
+        if len(self.null_scores) >= wanted or not stored:
+            return {}
+        sample = range(0, len(stored), -(-len(stored) // NULL_PAIRS_PER_QUERY))
+        scores = mirror_scores(query, [stored[k] for k in sample], self.settings, workers=self.workers)
+        return {k: score for k, score in zip(sample, scores, strict=True) if not np.isnan(score)}
 
 
 def _require(met: bool, expected: str, found: object) -> None:
@@ -233,13 +228,13 @@ def _is_finite(value: object) -> bool:
     return isinstance(value, Real) and bool(np.isfinite(float(value)))
 
 
-def null_scores(
+def mirror_scores(
     source: MapEntry, targets: Sequence[MapEntry], settings: Settings, *, workers: int = 1
-) -> list[float]:
-    """Scores of the mirror image of a submap against others, by the law of one pair."""
+) -> Array:
+    """Scores (N,) of the mirror image of a submap against others, by the law of one pair; NaN without one."""
     image = mirrored(source, settings)
     candidates = compare_many(image, targets, settings, pairs=NEVER_SIGNIFICANT, workers=workers)
-    return [-candidate.log_nfa for candidate in candidates if not np.isnan(candidate.log_nfa)]
+    return np.array([-candidate.log_nfa for candidate in candidates])
 
 
 def sample_null(
@@ -249,27 +244,21 @@ def sample_null(
     workers: int = 1,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[float]:
-    """Scores of mirror images for pairs spread evenly over those that a mission compares.
+    """Scores of mirror images for pairs spread evenly over those that a mission compares, without its loops.
 
-    Over those that odometry puts apart, if they are enough: ground that is seen twice and is symmetric in
-    parts resembles its own mirror image.
+    Ground that is seen twice and is symmetric in parts resembles its own mirror image.
     """
-    pairs, apart = [], []
-    for i, entry in enumerate(entries):
-        stored = max(0, i - settings.skip_recent)
-        plausible = plausible_by_odometry(entry, entries[:stored], entries[stored:i])
-        pairs += [(i, j) for j in range(stored)]
-        apart += [(i, j) for j in np.flatnonzero(~plausible).tolist()]
-    pairs = apart if len(apart) >= ENOUGH_APART else pairs
+    pairs = [(i, j) for i in range(len(entries)) for j in range(i - settings.skip_recent)]
     count = min(len(pairs), settings.calibration.null_pairs)
     chosen: dict[int, list[MapEntry]] = {}
     for k in np.linspace(0, len(pairs) - 1, count).astype(int) if count else ():
         chosen.setdefault(pairs[k][0], []).append(entries[pairs[k][1]])
-    scores: list[float] = []
+    scores, candidates = np.empty(0), []
     for done, (i, targets) in enumerate(chosen.items(), start=1):
-        scores += null_scores(entries[i], targets, settings, workers=workers)
+        scores = np.append(scores, mirror_scores(entries[i], targets, settings, workers=workers))
+        candidates += compare_many(entries[i], targets, settings, pairs=len(pairs), workers=workers)
         on_progress(done, len(chosen))
-    return scores
+    return without_loops(scores, candidates, settings, len(pairs))
 
 
 def fit_database(

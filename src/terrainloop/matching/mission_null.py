@@ -6,7 +6,7 @@ ground with this sensor: where few things are on smooth ground, or where things 
 of one pair says.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -111,3 +111,28 @@ def by_mission_null(
     score = candidate.score if candidate.score == NO_EVIDENCE else -log_nfa
     decided = replace(candidate, log_nfa=log_nfa, score=score, reason=reason)
     return decided.rejected(reason) if explained else decided
+
+
+def without_loops(
+    scores: Array, candidates: Sequence[LoopCandidate], settings: Settings, pairs: float
+) -> list[float]:
+    """Scores of mirror images without those of pairs that are loop closures even by the null they give.
+
+    Parameters
+    ----------
+    scores : array, (N,)
+        Of the mirror images, by the law of one pair; NaN where there is none.
+    candidates : sequence of LoopCandidate
+        The same N pairs, not mirrored, decided by the law of one pair.
+    settings : Settings
+    pairs : float
+        Number of pairs that `max_false_loops` is shared among.
+    """
+    kept = ~np.isnan(scores)
+    while True:
+        null = MissionNull.of(scores[kept], settings.calibration)
+        decided = (by_mission_null(candidate, null, settings, pairs) for candidate in candidates)
+        loops = np.fromiter(map(bool, decided), dtype=bool)
+        if not (kept & loops).any():
+            return [float(score) for score in scores[kept]]
+        kept &= ~loops
