@@ -138,7 +138,7 @@ def same_on_one_side():
 
     def ground(seed):
         def of(xy):
-            strip = xy[:, 0] < -4.0
+            strip = xy[:, 0] < -4.3
             (height, slope), (other, other_slope) = heights_and_slopes(0)(xy), heights_and_slopes(seed)(xy)
             return np.where(strip, height, other), np.where(strip[:, None], slope, other_slope)
 
@@ -260,7 +260,7 @@ def test_a_constant_that_moves_breaks_a_promise(name, constant, value):
 
 SCENE_MUTANTS = [
     ("common trace", "min_correlation", 0.0),
-    ("same on one side", "min_participation", 0.1),
+    ("same on one side", "min_participation", 0.05),
     ("a loop", "min_participation", 0.9),
     ("same ground twice", "ambiguity_ratio", 0.99),
     ("less like ground beside", "ambiguity_ratio", 0.1),

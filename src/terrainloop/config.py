@@ -178,7 +178,7 @@ class Calibration(_Frozen):
         0.25, ge=0, lt=1, description="smallest correlation of the fields of a loop closure"
     )
     min_participation: float = Field(
-        0.4, ge=0, lt=1, description="smallest share of the shared ground that the agreement rests on"
+        0.2, ge=0, lt=1, description="smallest share of the shared ground that the agreement rests on"
     )
     ambiguity_ratio: float = Field(0.5, gt=0, description="surprisal of a rival pose, share of the best's")
     equivalence_ratio: float = Field(

@@ -34,7 +34,7 @@ struct Calibration {
   double max_correlation = 0.999;   ///< beyond which none counts more
   // Decision
   double min_correlation = 0.25;   ///< of the fields of a loop closure
-  double min_participation = 0.4;  ///< of the shared ground, that the agreement rests on
+  double min_participation = 0.2;  ///< of the shared ground, that the agreement rests on
   double ambiguity_ratio = 0.5;    ///< surprisal of a rival pose, share of the best's
   double equivalence_ratio = 0.7;  ///< the same, above which a rival counts however likely it is by chance
   double ambiguity_chance = 0.01;  ///< NFA above which a rival is left to chance
