@@ -192,7 +192,6 @@ def test_rejections_are_those_of_python(word, pair):
         ("", {"rotation_by_warp": (0.1, 2.0, 1.0), "usual_warp_samples": 9.0}),
         ("", {"noise_factor": 9.0, "warp_noise_factor": 0.1, "reach_of_radius": 9.0}),
         ("", {"clip": 0.5, "blur": 0.6, "whitening_floor": 0.1, "spectrum_smoothing": 2.5}),
-        ("", {"local_mean": 1.5}),
         ("", {"pixels_per_length_scale": 1.5, "rotation_step": 0.7, "wraparound": 1.0}),
         ("", {"max_pixels": 20, "candidates": 3, "peak_threshold": 3.0}),
         ("", {"tail": 0.5, "independent_tests": 2.0, "max_correlation": 0.9}),

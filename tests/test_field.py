@@ -196,26 +196,7 @@ def test_waves_that_stand_out_are_taken_down(world):
         return spectrum.max() / spectrum.mean()
 
     field = field_of(rippled, SPACING)
-    assert peak(field.x) < 0.12 * peak(rippled.gradient_x)
-
-
-def test_long_waves_do_not_hide_short_ones(world):
-    """A map that is cut from a long slope that bends, as smooth ground is cut."""
-    ground = world(0).map(**BIG)
-    x = ground.resolution * np.arange(100)
-    bend = np.float32(5.0) * np.sin(2 * np.pi * x / 16.0 + 0.7).astype(np.float32)
-    bent = replace(ground, gradient_x=ground.gradient_x + bend)
-    agreement = agreement_at(field_of(ground, SPACING), field_of(bent, SPACING), np.eye(3))
-    assert agreement.correlation > 0.8  # 0.56 about the mean of all
-
-
-def test_the_local_mean_counts_what_is_known_only(terrain):
-    """A slope common to all of a map vanishes up to its border and up to holes."""
-    mask = terrain.mask.copy()
-    mask[10:20, 5:25] = False
-    holed = replace(terrain, mask=mask)
-    sloped = replace(holed, gradient_x=holed.gradient_x + np.float32(5.0))
-    assert_same_field(field_of(holed, SPACING), field_of(sloped, SPACING), atol=1e-3)
+    assert peak(field.x) < 0.1 * peak(rippled.gradient_x)
 
 
 # --- turning

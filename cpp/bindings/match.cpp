@@ -21,7 +21,6 @@ void visit_numbers(Calibration& c, const Visit& visit) {
   visit("pixels_per_length_scale", c.pixels_per_length_scale);
   visit("max_pixels", c.max_pixels);
   visit("blur", c.blur);
-  visit("local_mean", c.local_mean);
   visit("spectrum_smoothing", c.spectrum_smoothing);
   visit("whitening_floor", c.whitening_floor);
   visit("clip", c.clip);

@@ -123,7 +123,6 @@ TEST(HostileMaps, ImpossibleSettingsAreRefused) {
   const auto same = [](GradientMap&) {};
   for (double Calibration::* number : {&Calibration::pixels_per_length_scale,
                                        &Calibration::blur,
-                                       &Calibration::local_mean,
                                        &Calibration::spectrum_smoothing,
                                        &Calibration::whitening_floor,
                                        &Calibration::clip,
@@ -161,26 +160,14 @@ TEST(HostileMaps, ImpossibleSettingsAreRefused) {
 }
 
 TEST(HostileMaps, ExtremeSettingsHaveAnAnswer) {
-  for (double Calibration::* number : {&Calibration::pixels_per_length_scale,
-                                       &Calibration::blur,
-                                       &Calibration::local_mean,
-                                       &Calibration::spectrum_smoothing,
-                                       &Calibration::whitening_floor,
-                                       &Calibration::clip,
-                                       &Calibration::rotation_step,
-                                       &Calibration::min_shared_area,
-                                       &Calibration::min_separation,
-                                       &Calibration::peak_threshold,
-                                       &Calibration::tail,
-                                       &Calibration::independent_tests,
-                                       &Calibration::ambiguity_ratio,
-                                       &Calibration::equivalence_ratio,
-                                       &Calibration::ambiguity_chance,
-                                       &Calibration::block,
-                                       &Calibration::noise_factor,
-                                       &Calibration::warp_noise_factor,
-                                       &Calibration::usual_warp,
-                                       &Calibration::usual_warp_samples})
+  for (double Calibration::* number :
+       {&Calibration::pixels_per_length_scale, &Calibration::blur, &Calibration::spectrum_smoothing,
+        &Calibration::whitening_floor, &Calibration::clip, &Calibration::rotation_step,
+        &Calibration::min_shared_area, &Calibration::min_separation, &Calibration::peak_threshold,
+        &Calibration::tail, &Calibration::independent_tests, &Calibration::ambiguity_ratio,
+        &Calibration::equivalence_ratio, &Calibration::ambiguity_chance, &Calibration::block,
+        &Calibration::noise_factor, &Calibration::warp_noise_factor, &Calibration::usual_warp,
+        &Calibration::usual_warp_samples})
     for (const double odd : {kTiny, 1e-6, 1e-3, 1e6, kHuge}) {
       MatchSettings settings;
       settings.calibration.*number = odd;

@@ -133,9 +133,6 @@ class Calibration(_Frozen):
     pixels_per_length_scale: float = Field(2.0, gt=0, description="field: pixels per length scale")
     max_pixels: int = Field(96, ge=8, description="field: pixels across; larger maps take twice the spacing")
     blur: float = Field(0.4, gt=0, description="field: standard deviation of the low-pass filter, pixels")
-    local_mean: float = Field(
-        4.0, gt=0, description="field: standard deviation of the window of the local mean, pixels"
-    )
     spectrum_smoothing: float = Field(
         1.5, gt=0, description="field: smoothing of the power spectrum, cycles per width"
     )

@@ -20,14 +20,13 @@ from terrainloop.gradient_map import GradientMap
 
 RAYLEIGH_MEDIAN = float(np.sqrt(2 * np.log(2)))  # median length of a vector of two standard normal components
 TINY = float(np.finfo(np.float32).tiny)
-ROUNDING = 1e-5  # of the largest value: what a subtraction in single precision leaves of level ground
 
 Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """A gradient field on a coarse grid: weighted by its variance, local mean subtracted, whitened, clipped.
+    """A gradient field on a coarse grid: mean subtracted, weighted by its variance, whitened, soft-clipped.
 
     Attributes
     ----------
@@ -92,9 +91,9 @@ def field_of(gradient_map: GradientMap, spacing: float, calibration: Calibration
     """The field of a map, averaged over pixels of `spacing` metres.
 
     The mean slope is subtracted, since gravity is never known exactly, and gradients are weighted down where
-    their variance is high. Waves longer than the window of a local mean are subtracted too. Then the spectrum
-    is flattened, because the waves that dominate it, such as ripples or a long slope, identify the place
-    least; and long vectors are soft-clipped, so that no single crest dominates.
+    their variance is high. Then the spectrum is flattened, because the waves that dominate it, such as
+    ripples or a long slope, identify the place least; and long vectors are soft-clipped, so that no single
+    crest dominates.
 
     Parameters
     ----------
@@ -122,9 +121,8 @@ def field_of(gradient_map: GradientMap, spacing: float, calibration: Calibration
     observed = average(mask)
     valid = (observed > 0.5).astype(np.float32)
     share = np.asarray(valid / np.maximum(observed, 0.5), dtype=np.float32)
-    known = np.asarray(average(weight) * share, dtype=np.float32)
-    x, y = (_about_local_mean(average(image * weight) * share, known, calibration) for image in (x, y))
-    x, y = _clipped(*_whitened(x, y, valid, calibration), valid, calibration)
+    white = _whitened(average(x * weight) * share, average(y * weight) * share, valid, calibration)
+    x, y = _clipped(*white, valid, calibration)
     return Field(x, y, valid, gradient_map.origin, spacing, gradient_map.parameters.length_scale)
 
 
@@ -142,21 +140,6 @@ def rotate_field(field: Field, affine: Array, shape: tuple[int, int]) -> tuple[I
     rows, columns = shape
     x, y, valid = _core.turn_field(field.x, field.y, field.valid, affine, rows=rows, cols=columns)
     return x, y, valid
-
-
-def _about_local_mean(weighted: Image, weight: Image, calibration: Calibration) -> Image:
-    """A weighted image less the mean around each pixel, which counts what is known only.
-
-    A map cuts long waves off at its border. The step that this leaves there has waves of all lengths, which
-    would hide the short ones of the ground: they are the fainter, the smoother it is.
-    """
-
-    def around(image: Image) -> NDArray[Any]:
-        return cv2.GaussianBlur(image, (0, 0), calibration.local_mean, borderType=cv2.BORDER_CONSTANT)
-
-    rest = weighted - weight * around(weighted) / np.maximum(around(weight), TINY)
-    rest[np.abs(rest) < ROUNDING * np.abs(weighted).max()] = 0.0
-    return np.asarray(rest, dtype=np.float32)
 
 
 def _whitened(x: Image, y: Image, valid: Image, calibration: Calibration) -> tuple[Image, Image]:

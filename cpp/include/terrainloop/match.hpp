@@ -16,7 +16,6 @@ struct Calibration {
   double pixels_per_length_scale = 2.0;
   int max_pixels = 96;              ///< across; larger maps take twice the spacing
   double blur = 0.4;                ///< standard deviation of the low-pass filter, pixels
-  double local_mean = 4.0;          ///< standard deviation of the window of the local mean, pixels
   double spectrum_smoothing = 1.5;  ///< of the power spectrum, cycles per width
   double whitening_floor = 0.3;     ///< added to the spectrum, share of its mean
   double clip = 1.5;                ///< soft-clipping scale, robust standard deviations

@@ -10,7 +10,6 @@ namespace terrainloop::matching {
 namespace {
 
 constexpr float kTiny = std::numeric_limits<float>::min();
-constexpr float kRounding = 1e-5f;  // of the largest value: what a subtraction leaves of level ground
 
 /// Weights of consecutive pixels of a line.
 struct Taps {
@@ -91,26 +90,6 @@ double weighted_mean(const ImageView<float>& image, const std::vector<float>& we
   return total > 0.0 ? sum / total : 0.0;
 }
 
-/// Subtracts the mean around each pixel, which counts what is known only: a map cuts long waves off at its
-/// border, and the step that this leaves there would hide the short waves of smooth ground.
-void subtract_local_mean(Field& field, const std::vector<float>& known, const Calibration& calibration) {
-  const std::vector<Taps> down = resampling(field.rows, 1.0, calibration.local_mean);
-  const std::vector<Taps> across = resampling(field.cols, 1.0, calibration.local_mean);
-  const auto around = [&](const std::vector<float>& image) {
-    return resampled(down, across, field.rows, field.cols, [&](std::size_t i) { return image[i]; });
-  };
-  const std::vector<float> total = around(known);
-  for (std::vector<float>* component : {&field.x, &field.y}) {
-    const std::vector<float> sum = around(*component);
-    float largest = 0.0f;
-    for (const float value : *component) largest = std::max(largest, std::abs(value));
-    for (std::size_t i = 0; i < sum.size(); ++i) {
-      const float rest = (*component)[i] - known[i] * sum[i] / std::max(total[i], kTiny);
-      (*component)[i] = std::abs(rest) < kRounding * largest ? 0.0f : rest;
-    }
-  }
-}
-
 /// Divides each vector by sqrt(1 + (length / clip)^2), so that no single crest dominates, and by the robust
 /// deviation: the search transforms energies and areas together, so they must not differ by much.
 void clip(Field& field, const Calibration& calibration) {
@@ -181,16 +160,13 @@ Field field_of(const GradientMapView& map, double spacing, const Calibration& ca
               map.origin_y,
               spacing,
               map.length_scale};
-  std::vector<float> known = resampled(down, across, rows, cols, [&](std::size_t i) { return weights[i]; });
   for (std::size_t i = 0; i < field.valid.size(); ++i) {
     const float observed = field.valid[i], share = observed > 0.5f ? 1.0f / observed : 0.0f;
     field.x[i] *= share;
     field.y[i] *= share;
-    known[i] *= share;
     field.valid[i] = observed > 0.5f ? 1.0f : 0.0f;
   }
   measure(field);
-  subtract_local_mean(field, known, calibration);
   whiten(field, calibration);
   clip(field, calibration);
   return field;

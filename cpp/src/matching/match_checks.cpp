@@ -76,9 +76,9 @@ void check_settings(const MatchSettings& settings) {
   const Calibration& c = settings.calibration;
   require(positive({settings.pairs, settings.max_false_loops}), "pairs and max_false_loops must be positive");
   require(
-      sensible({c.pixels_per_length_scale, c.blur, c.local_mean, c.spectrum_smoothing, c.whitening_floor,
-                c.clip, c.rotation_step, c.min_shared_area, c.min_separation, c.peak_threshold, c.wraparound,
-                c.tail, c.independent_tests, c.max_correlation, c.ambiguity_ratio, c.equivalence_ratio,
+      sensible({c.pixels_per_length_scale, c.blur, c.spectrum_smoothing, c.whitening_floor, c.clip,
+                c.rotation_step, c.min_shared_area, c.min_separation, c.peak_threshold, c.wraparound, c.tail,
+                c.independent_tests, c.max_correlation, c.ambiguity_ratio, c.equivalence_ratio,
                 c.ambiguity_chance},
                1e-6) &&
           sensible({c.block, c.noise_factor, c.warp_noise_factor, c.usual_warp, c.usual_warp_samples}, 1e-6),
