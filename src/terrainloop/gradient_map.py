@@ -265,9 +265,11 @@ class GradientMap(ReadOnlyArrays):
         """
         rows, columns = self.mask.shape
         half = self.resolution * np.array([columns - 1, rows - 1]) / 2
+        middle = np.array(self.origin) + half
+        if np.hypot(*middle) <= FAR * np.hypot(*half):
+            return np.zeros(3)
         height = float(np.median(self.elevation[self.mask])) if self.mask.any() else 0.0
-        middle = np.array([*(np.array(self.origin) + half), height])
-        return np.round(middle) if np.hypot(*middle[:2]) > FAR * np.hypot(*half) else np.zeros(3)
+        return np.round([*middle, height])
 
     def to_bytes(self) -> bytes:
         """The map as the bytes of an ``.npz`` file."""

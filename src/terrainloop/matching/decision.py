@@ -10,7 +10,7 @@ from terrainloop.geometry import Array, inverse, rotation_about, transform, yaw_
 from terrainloop.loop import NO_EVIDENCE, LoopCandidate
 from terrainloop.matching.correspondences import associate
 from terrainloop.matching.hypotheses import Hypothesis, Pair, propose_hypotheses
-from terrainloop.matching.lift import PlanarPrecision, lift_to_se3
+from terrainloop.matching.lift import PlanarPrecision, lift_to_se3, pose_in_se3
 from terrainloop.matching.mission_warp import warp_variance
 from terrainloop.matching.overlay import Overlay
 from terrainloop.matching.query import Query
@@ -21,7 +21,6 @@ from terrainloop.matching.ssd import compute_ssd
 
 REJECTED_STEP = 3  # every third row and column is enough to describe a rejected pair
 TURNS = 7  # by equal parts of a full turn: only round ground looks the same after each of them
-UNKNOWN = np.full((3, 3), np.nan)
 LN_10 = float(np.log(10.0))
 
 
@@ -150,21 +149,23 @@ def _ambiguity(pair: Pair, best: Hypothesis, rivals: list[Hypothesis]) -> str:
 def _candidate(pair: Pair, weighed: Weighed, refinement: Refinement | None, objection: str) -> LoopCandidate:
     """The decision and the pose in SE(3); without a covariance where the pair is not a loop closure."""
     best, calibration = weighed.best, pair.settings.calibration
+    warp, covariance = None, np.full((6, 6), np.nan)
     if refinement is None:
         T = best.T_target_source
         overlay = Overlay(*pair.maps, T, REJECTED_STEP)
-        precision = PlanarPrecision(transform(T, pair.source_field.centre), UNKNOWN)
+        T_target_source = pose_in_se3(overlay, transform(T, pair.source_field.centre), calibration)
     else:
         T = refinement.T_target_source
         overlay = Overlay(*pair.maps, T)
         precision = PlanarPrecision(refinement.pivot, refinement.covariance)
-    T_target_source, warp = lift_to_se3(overlay, precision, calibration)
+        T_target_source, warp = lift_to_se3(overlay, precision, calibration)
+        covariance = warp.covariance(warp_variance([warp], calibration))
     ssd, inliers = compute_ssd(overlay), _inliers(pair, T) if refinement else 0
     return LoopCandidate(
         source=pair.source.name,
         target=pair.target.name,
         T_target_source=T_target_source,
-        covariance=warp.covariance(warp_variance([warp], calibration)),
+        covariance=covariance,
         inliers=inliers,
         ssd=ssd.value,
         ssd_ratio=ssd.ratio,
@@ -178,7 +179,7 @@ def _candidate(pair: Pair, weighed: Weighed, refinement: Refinement | None, obje
         inlier_score=inliers * max(0.0, 1.0 - ssd.ratio),
         source_origin=pair.source.gradient_map.local_origin,
         target_origin=pair.target.gradient_map.local_origin,
-        warp=None if refinement is None else warp,
+        warp=warp,
     )
 
 

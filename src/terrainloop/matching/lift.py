@@ -5,6 +5,7 @@ only then is it referred to the maps' local origins.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,35 +58,46 @@ def lift_to_se3(overlay: Overlay, precision: PlanarPrecision, calibration: Calib
         Its covariances are those of (x, y, z, roll, pitch, yaw) of the transform between the maps' local
         origins; NaN where the overlap is too small to determine the tilt.
     """
-    source, target, T_planar = overlay.source, overlay.target, overlay.T_target_source
-    pivot = precision.pivot
-    height = overlay.of_source(source.elevation)
-    ground = _Ground(
-        overlay.positions - pivot,
-        overlay.of_target(target.elevation) - height,
-        np.stack([overlay.of_target(target.gradient_x), overlay.of_target(target.gradient_y)], axis=1),
-    )
-    plane = _fit_plane(ground, calibration, target.parameters.length_scale)
-    if plane is None:
-        no_tilt = se3(T_planar[0, 2], T_planar[1, 2], 0.0, 0.0, 0.0, yaw_of(T_planar))
+    source, target, pivot = overlay.source, overlay.target, precision.pivot
+    plane = _Plane.of(overlay, pivot, calibration)
+    if plane is None or np.isnan(plane.covariance).any():
         nothing, unknown = np.full(3, np.nan), np.full((6, 6), np.nan)
-        return no_tilt, Warp(nothing, nothing, unknown, unknown)
-    z, w_x, w_y = plane.parameters
-    R = (se3(0, 0, 0, w_x, w_y, 0) @ se3(0, 0, 0, 0, 0, yaw_of(T_planar)))[:3, :3]
-    pivot_source = np.array([*transform(inverse(T_planar), pivot), height.mean()])
-    T = np.eye(4)
-    T[:3, :3] = R
-    T[:3, 3] = np.array([*pivot, height.mean() + z]) - R @ pivot_source
+        return _lifted(overlay, pivot, None), Warp(nothing, nothing, unknown, unknown)
+    T, pivot_source = _lifted(overlay, pivot, plane), _pivot_in_source(overlay, pivot)
     away = _reach(target, pivot) ** 2 + _reach(source, pivot_source[:2]) ** 2
-    reach = away + 2 * calibration.reach_of_radius * plane.radius**2
+    reach = away + 2 * calibration.reach_of_radius * plane.ground.radius**2
     by_variance = [*(reach * f for f in calibration.motion_by_warp), *calibration.rotation_by_warp]
-    arm = R @ (pivot_source - source.local_origin)
+    arm = T[:3, :3] @ (pivot_source - source.local_origin)
+    warp, noise = plane.warp
     return T, Warp(
-        squares=plane.warp**2 / 2,  # of two submaps
-        noise=plane.warp_noise / 2,
+        squares=warp**2 / 2,  # of two submaps
+        noise=noise / 2,
         rigid=_at_local_origin(plane.covariance_with(precision.covariance), arm, yaw_of(T)),
         by_variance=_at_local_origin(np.diag(by_variance), arm, yaw_of(T)),
     )
+
+
+def pose_in_se3(overlay: Overlay, pivot: Array, calibration: Calibration) -> Array:
+    """The transform (4, 4) of `lift_to_se3` alone, for a pair that needs no covariance."""
+    return _lifted(overlay, pivot, _Plane.of(overlay, pivot, calibration))
+
+
+def _lifted(overlay: Overlay, pivot: Array, plane: "_Plane | None") -> Array:
+    """The alignment in SE(3) with the height and tilt of a plane; without them if there is none."""
+    T_planar = overlay.T_target_source
+    if plane is None:
+        return se3(T_planar[0, 2], T_planar[1, 2], 0.0, 0.0, 0.0, yaw_of(T_planar))
+    z, w_x, w_y = plane.parameters
+    pivot_source = _pivot_in_source(overlay, pivot)
+    T = se3(0, 0, 0, w_x, w_y, 0) @ se3(0, 0, 0, 0, 0, yaw_of(T_planar))
+    T[:3, 3] = np.array([*pivot, pivot_source[2] + z]) - T[:3, :3] @ pivot_source
+    return T
+
+
+def _pivot_in_source(overlay: Overlay, pivot: Array) -> Array:
+    """The pivot (3,) in the frame of the source, at the mean height of the overlap."""
+    height = overlay.of_source(overlay.source.elevation).mean()
+    return np.array([*transform(inverse(overlay.T_target_source), pivot), height])
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,16 +108,26 @@ class _Ground:
     difference: Array
     slope: Array
 
+    @classmethod
+    def of(cls, overlay: Overlay, pivot: Array) -> "_Ground":
+        """The ground of an overlay."""
+        source, target = overlay.source, overlay.target
+        return cls(
+            overlay.positions - pivot,
+            overlay.of_target(target.elevation) - overlay.of_source(source.elevation),
+            np.stack([overlay.of_target(target.gradient_x), overlay.of_target(target.gradient_y)], axis=1),
+        )
+
     def __getitem__(self, kept: NDArray[np.bool_]) -> "_Ground":
         return _Ground(self.positions[kept], self.difference[kept], self.slope[kept])
 
-    @property
+    @cached_property
     def design(self) -> Array:
         """Derivative (N, 3) of the elevation difference by (z, w_x, w_y)."""
         x, y = self.positions.T
         return np.stack([np.ones_like(x), y, -x], axis=1)
 
-    @property
+    @cached_property
     def bent_design(self) -> Array:
         """The design and, as rises over the radius, the second-degree parts (N, 6)."""
         x, y = self.positions.T / self.radius
@@ -118,7 +140,7 @@ class _Ground:
         (x, y), (slope_x, slope_y) = self.positions.T, self.slope.T
         return np.stack([slope_x, slope_y, x * slope_y - y * slope_x], axis=1)
 
-    @property
+    @cached_property
     def radius(self) -> float:
         """Root mean square distance from the pivot, metres."""
         return float(np.sqrt((self.positions**2).sum(axis=1).mean()))
@@ -132,64 +154,63 @@ class _Plane:
     ----------
     parameters : array, (3,)
         (z, w_x, w_y).
-    covariance : array, (3, 3)
-        By the scatter of the elevations.
-    by_alignment : array, (3, 3)
-        Derivative of the parameters by (x, y, yaw) of the alignment.
-    warp, warp_noise : array, (3,)
-        Second-degree part, as rises over the radius, and its variances by noise; NaN if undetermined.
-    radius : float
-        Of the ground, metres.
+    ground : _Ground
+        Without outliers.
+    calibration : Calibration
+    block : float
+        Side of the independent blocks of ground, metres.
     """
 
     parameters: Array
-    covariance: Array
-    by_alignment: Array
-    warp: Array
-    warp_noise: Array
-    radius: float
+    ground: _Ground
+    calibration: Calibration
+    block: float
+
+    @classmethod
+    def of(cls, overlay: Overlay, pivot: Array, calibration: Calibration) -> "_Plane | None":
+        """By least squares, after outliers from a bent plane were rejected; None where that is too little."""
+        ground = _Ground.of(overlay, pivot)
+        if len(ground.positions) < MIN_PIXELS:
+            return None
+        residual = ground.difference - ground.bent_design @ _fitted(ground, ground.bent_design)
+        spread = 1.4826 * np.median(np.abs(residual - np.median(residual)))
+        kept = ground[np.abs(residual) <= max(OUTLIER * spread, 1e-9)]
+        block = calibration.block * overlay.target.parameters.length_scale
+        return cls(_fitted(kept, kept.design), kept, calibration, block)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(3, 3) of the parameters, by the scatter of the elevations; NaN if they are undetermined."""
+        scatter = _covariance(self.ground, self.ground.design, self.parameters, self.block)
+        return self.calibration.noise_factor * scatter
+
+    @cached_property
+    def warp(self) -> tuple[Array, Array]:
+        """Second-degree part (3,), as rises over the radius, and its variances (3,) by noise."""
+        bent = _fitted(self.ground, self.ground.bent_design)
+        noise = _covariance(self.ground, self.ground.bent_design, bent, self.block)
+        return bent[3:], self.calibration.warp_noise_factor * np.diag(noise)[3:]
 
     def covariance_with(self, alignment: Array) -> Array:
         """(6, 6) of (x, y, z, w_x, w_y, yaw), from that of (x, y, yaw) (3, 3)."""
+        by_alignment = np.linalg.lstsq(self.ground.design, self.ground.by_alignment, rcond=None)[0]
         planar, tilt = [0, 1, 5], [2, 3, 4]
         covariance = np.zeros((6, 6))
         covariance[np.ix_(planar, planar)] = alignment
-        covariance[np.ix_(tilt, planar)] = self.by_alignment @ alignment
+        covariance[np.ix_(tilt, planar)] = by_alignment @ alignment
         covariance[np.ix_(planar, tilt)] = covariance[np.ix_(tilt, planar)].T
-        covariance[np.ix_(tilt, tilt)] = self.covariance + self.by_alignment @ alignment @ self.by_alignment.T
+        covariance[np.ix_(tilt, tilt)] = self.covariance + by_alignment @ alignment @ by_alignment.T
         return covariance
 
 
-def _fit_plane(ground: _Ground, calibration: Calibration, length_scale: float) -> _Plane | None:
-    """The plane by least squares, after outliers from a bent one were rejected; None if undetermined."""
-    if len(ground.positions) < MIN_PIXELS:
-        return None
-    bent = np.linalg.lstsq(ground.bent_design, ground.difference, rcond=None)[0]
-    residual = ground.difference - ground.bent_design @ bent
-    spread = 1.4826 * np.median(np.abs(residual - np.median(residual)))
-    kept = ground[np.abs(residual) <= max(OUTLIER * spread, 1e-9)]
-    block = calibration.block * length_scale
-    plane, covariance = _least_squares(kept, kept.design, block)
-    if np.isnan(covariance).any():
-        return None
-    bent, noise = _least_squares(kept, kept.bent_design, block)
-    by_alignment = np.linalg.lstsq(kept.design, kept.by_alignment, rcond=None)[0]
-    return _Plane(
-        parameters=plane,
-        covariance=calibration.noise_factor * covariance,
-        by_alignment=np.asarray(by_alignment, dtype=float),
-        warp=bent[3:],
-        warp_noise=calibration.warp_noise_factor * np.diag(noise)[3:],
-        radius=kept.radius,
-    )
+def _fitted(ground: _Ground, design: Array) -> Array:
+    """Parameters (P,) that explain the elevation difference best."""
+    return np.asarray(np.linalg.lstsq(design, ground.difference, rcond=None)[0], dtype=float)
 
 
-def _least_squares(ground: _Ground, design: Array, block: float) -> tuple[Array, Array]:
-    """Parameters (P,) that explain the elevation difference best, and their covariance (P, P)."""
-    parameters = np.linalg.lstsq(design, ground.difference, rcond=None)[0]
+def _covariance(ground: _Ground, design: Array, parameters: Array, block: float) -> Array:
     residual = ground.difference - design @ parameters
-    covariance = block_covariance(design, residual, design.T @ design, ground.positions, block)
-    return np.asarray(parameters, dtype=float), covariance
+    return block_covariance(design, residual, design.T @ design, ground.positions, block)
 
 
 def covariance_of_inliers(matched: Array, residuals: Array, floor: float) -> Array:
