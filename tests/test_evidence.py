@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 from conftest import STRICT, flat, map_of, ridges, with_match
-from scipy.stats import beta
+from scipy.stats import beta, binom
 
 from terrainloop.config import Calibration
 from terrainloop.entry import MapEntry
@@ -20,6 +20,7 @@ from terrainloop.matching.mission_warp import warp_variance
 from terrainloop.matching.overlay import Overlay
 from terrainloop.matching.refine import refine
 from terrainloop.matching.register import compare, register
+from terrainloop.matching.significance import combined_surprisal, surprisal_of_inliers
 from terrainloop.record import SubmapRecord
 
 CALIBRATION = Calibration()
@@ -76,6 +77,33 @@ def test_surprisal_at_the_ends():
     assert np.isfinite(surprisal(1.0, 100.0))
     assert surprisal(1.0, 100.0) > surprisal(0.9, 100.0)
     assert surprisal(1.0, 100.0) == surprisal(0.9999, 100.0)  # no map is trusted to agree that well
+
+
+def test_surprisal_of_inliers_is_the_binomial_tail():
+    for inliers, associations, chance in ((1, 40, 0.01), (3, 130, 0.002), (20, 150, 0.003), (40, 40, 0.5)):
+        exact = -binom.logsf(inliers - 1, associations, chance)
+        assert surprisal_of_inliers(inliers, associations, chance) == pytest.approx(exact, rel=1e-6)
+    assert surprisal_of_inliers(0, 50, 0.01) == surprisal_of_inliers(-2, 50, 0.01) == 0
+    assert surprisal_of_inliers(3, 3, 1.0) == pytest.approx(0)
+    assert np.isfinite(surprisal_of_inliers(400, 400, 1e-4))
+
+
+def test_two_surprisals_are_as_rare_together_as_they_say():
+    """Independent ones of unit decay: chance exceeds a level no more often than exp(-level), nor far less."""
+    rng = np.random.default_rng(0)
+    field, inliers = rng.exponential(size=(2, 200_000))
+    both = np.array([combined_surprisal(f, i) for f, i in zip(field, inliers, strict=True)])
+    for level in (1.0, 3.0, 5.0):
+        assert 0.4 * np.exp(-level) < (both >= level).mean() < 1.05 * np.exp(-level)
+
+
+def test_inliers_can_only_help():
+    """But for the factor of two that it costs to look at them."""
+    assert combined_surprisal(30.0, 0.0) == pytest.approx(30.0 - np.log(2))
+    assert combined_surprisal(30.0, 30.0) > 54.0
+    assert combined_surprisal(0.0, 0.0) == 0.0
+    values = [combined_surprisal(12.0, inliers) for inliers in np.linspace(0, 50, 60)]
+    assert (np.diff(values) >= 0).all()
 
 
 def test_the_number_of_poses_goes_with_what_was_tried():
@@ -270,16 +298,14 @@ def test_either_may_be_the_source(world):
     assert there.overlap == pytest.approx(back.overlap, abs=0.02)
 
 
-def test_keypoints_describe_a_loop_and_do_not_decide(world):
+def test_keypoints_make_a_loop_more_evident_and_do_not_move_it(world):
     source, target = (mapped(n, m) for n, m in (("b", world(0).map(se2(0.4, 0, 1))), ("a", world(0).map())))
     nothing = replace(source.features, positions=source.features.positions[:0])
     loop, without = (compare(s, target, STRICT) for s in (source, replace(source, features=nothing)))
     assert loop.inliers > 5
     assert without.inliers == 0
-    assert without.score == loop.score
+    assert loop.score > without.score + 5
     np.testing.assert_array_equal(without.T_target_source, loop.T_target_source)
-    unrelated = compare(mapped("c", world(3).map()), target, STRICT)
-    assert unrelated.inliers == 0  # counted for loops only
 
 
 def test_unrelated_ground_is_explained_by_chance(world):

@@ -6,15 +6,13 @@ import numpy as np
 
 from terrainloop.config import Calibration, Settings
 from terrainloop.entry import MapEntry
-from terrainloop.geometry import Array, inverse, rotation_about, transform, yaw_of
+from terrainloop.geometry import inverse, rotation_about, transform, yaw_of
 from terrainloop.loop import NO_EVIDENCE, LoopCandidate
-from terrainloop.matching.correspondences import associate
 from terrainloop.matching.hypotheses import Hypothesis, Pair, propose_hypotheses
 from terrainloop.matching.lift import PlanarPrecision, lift_to_se3, pose_in_se3
 from terrainloop.matching.mission_warp import warp_variance
 from terrainloop.matching.overlay import Overlay
 from terrainloop.matching.query import Query
-from terrainloop.matching.ransac import get_inliers, inlier_radius_of
 from terrainloop.matching.refine import Refinement, refine
 from terrainloop.matching.significance import log_num_tests
 from terrainloop.matching.ssd import compute_ssd
@@ -60,13 +58,14 @@ class Weighed:
         return (self.log_tests - self.best.surprisal) / LN_10
 
     def rivalling(self, calibration: Calibration) -> float:
-        """Surprisal above which another pose explains the pair as well, nats.
+        """Surprisal of the field above which another pose explains the pair as well, nats.
 
-        It must be a large share of the best's, and either unlikely by chance or nearly all of it.
+        It must be a large share of the best's, and either unlikely by chance or nearly all of it. Keypoints
+        are no help: where the field is the same after a turn, theirs is too.
         """
         by_chance = self.log_tests - float(np.log(calibration.ambiguity_chance))
-        near = calibration.equivalence_ratio * self.best.surprisal
-        return max(calibration.ambiguity_ratio * self.best.surprisal, min(by_chance, near))
+        near = calibration.equivalence_ratio * self.best.of_field
+        return max(calibration.ambiguity_ratio * self.best.of_field, min(by_chance, near))
 
     @property
     def significant(self) -> bool:
@@ -118,7 +117,7 @@ def _objection(pair: Pair, weighed: Weighed, refinement: Refinement | None) -> s
         return f"uneven agreement, it rests on {participation:.0%} of the shared ground"
     T, rivalling = best.T_target_source, weighed.rivalling(calibration)
     equal = [
-        h for h in weighed.rivals if h.surprisal > rivalling and not pair.same_place(h.T_target_source, T)
+        h for h in weighed.rivals if h.of_field > rivalling and not pair.same_place(h.T_target_source, T)
     ]
     if equal:
         return _ambiguity(pair, best, equal)
@@ -127,21 +126,21 @@ def _objection(pair: Pair, weighed: Weighed, refinement: Refinement | None) -> s
     if np.isnan(refinement.covariance).any():
         return "undetermined, too little ground to determine the pose"
     slid = refinement.weakest(calibration.min_separation * pair.source_field.length_scale)
-    if any(pair.weigh(T).surprisal > rivalling for T in slid):
+    if any(pair.weigh(T).of_field > rivalling for T in slid):
         return "undetermined, the match slides"
     return ""
 
 
 def _ambiguity(pair: Pair, best: Hypothesis, rivals: list[Hypothesis]) -> str:
     """Which poses explain a pair as well as the best, in words."""
-    T, round_ground = best.T_target_source, pair.settings.calibration.ambiguity_ratio * best.surprisal
+    T, round_ground = best.T_target_source, pair.settings.calibration.ambiguity_ratio * best.of_field
     motion = max((h.T_target_source @ inverse(T) for h in rivals), key=lambda motion: abs(yaw_of(motion)))
     centre = np.linalg.lstsq(np.eye(2) - motion[:2, :2], motion[:2, 2], rcond=None)[0]
     angles = 2 * np.pi * np.arange(1, TURNS) / TURNS
-    turned = [pair.weigh(rotation_about(centre, angle) @ T).surprisal for angle in angles]
+    turned = [pair.weigh(rotation_about(centre, angle) @ T).of_field for angle in angles]
     if np.median(turned) > round_ground:
         return f"undetermined in yaw, the ground is round about x {centre[0]:.2f} m, y {centre[1]:.2f} m"
-    rival = max(rivals, key=lambda h: h.surprisal).T_target_source
+    rival = max(rivals, key=lambda h: h.of_field).T_target_source
     x, y, yaw = *rival[:2, 2], np.degrees(yaw_of(rival))
     return f"ambiguous, the pose x {x:.2f} m, y {y:.2f} m, yaw {yaw:.0f} deg fits as well"
 
@@ -160,7 +159,7 @@ def _candidate(pair: Pair, weighed: Weighed, refinement: Refinement | None, obje
         precision = PlanarPrecision(refinement.pivot, refinement.covariance)
         T_target_source, warp = lift_to_se3(overlay, precision, calibration)
         covariance = warp.covariance(warp_variance([warp], calibration))
-    ssd, inliers = compute_ssd(overlay), _inliers(pair, T) if refinement else 0
+    ssd, inliers = compute_ssd(overlay), len(pair.inliers_of(T))
     return LoopCandidate(
         source=pair.source.name,
         target=pair.target.name,
@@ -181,13 +180,6 @@ def _candidate(pair: Pair, weighed: Weighed, refinement: Refinement | None, obje
         target_origin=pair.target.gradient_map.local_origin,
         warp=warp,
     )
-
-
-def _inliers(pair: Pair, T: Array) -> int:
-    """Number of keypoint associations that agree with a pose: a description of loops, no evidence."""
-    associations = associate(pair.source.features, pair.target.features)
-    radius = inlier_radius_of(pair.settings, pair.target.gradient_map)
-    return int(get_inliers(associations, T[None], radius).sum())
 
 
 def _reason(weighed: Weighed, objection: str, allowed: float) -> str:

@@ -1,6 +1,7 @@
 """Hypotheses for the relative pose of two submaps: proposed by the search, refined, weighed."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -9,11 +10,13 @@ from terrainloop.entry import MapEntry
 from terrainloop.field import Field
 from terrainloop.geometry import Array, yaw_of
 from terrainloop.gradient_map import GradientMap
+from terrainloop.matching.correspondences import Associations, associate
 from terrainloop.matching.overlay import Agreement, agreement_at, participation_at
 from terrainloop.matching.query import Query
+from terrainloop.matching.ransac import get_inliers, inlier_radius_of
 from terrainloop.matching.refine import ROUGH, refine
 from terrainloop.matching.search import SearchResult, same_place, search
-from terrainloop.matching.significance import surprisal_of_field
+from terrainloop.matching.significance import combined_surprisal, surprisal_of_field, surprisal_of_inliers
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,12 +29,15 @@ class Hypothesis:
         SE(2).
     agreement : Agreement
         How well the two fields agree at this pose.
-    surprisal : float
+    of_field : float
         -ln P(agreement at least this good | unrelated ground) in one test, nats.
+    surprisal : float
+        The same of field and keypoints together.
     """
 
     T_target_source: Array
     agreement: Agreement
+    of_field: float
     surprisal: float
 
 
@@ -69,6 +75,16 @@ class Pair:
         """The larger length scale of the two maps, metres."""
         return max(self.source_field.length_scale, self.target_field.length_scale)
 
+    @cached_property
+    def associations(self) -> Associations:
+        """Keypoints of the two that may be the same."""
+        return associate(self.source.features, self.target.features)
+
+    def inliers_of(self, T: Array) -> Array:
+        """Keypoints (n, 2) of the target, metres, whose associations agree with a pose."""
+        radius = inlier_radius_of(self.settings, self.target.gradient_map)
+        return self.associations.target[get_inliers(self.associations, T[None], radius)[0]]
+
     def same_place(self, T: Array, other: Array) -> bool:
         """Whether two poses are closer than the places that a search distinguishes."""
         return same_place(T, other, self.source_field, self.settings.calibration)
@@ -80,9 +96,19 @@ class Pair:
         null_area = self.found.null_area_at(yaw_of(T))
         enough = agreement.area >= calibration.min_shared_area * self.length_scale**2
         if not enough or agreement.correlation <= 0 or np.isnan(null_area):
-            return Hypothesis(T, agreement, 0.0)
-        samples = agreement.area / null_area
-        return Hypothesis(T, agreement, surprisal_of_field(agreement.correlation, samples, calibration))
+            return Hypothesis(T, agreement, 0.0, 0.0)
+        of_field = surprisal_of_field(agreement.correlation, agreement.area / null_area, calibration)
+        if not len(self.associations):
+            return Hypothesis(T, agreement, of_field, of_field)
+        return Hypothesis(T, agreement, of_field, combined_surprisal(of_field, self._of_inliers(T)))
+
+    def _of_inliers(self, T: Array) -> float:
+        """Surprisal of the inliers in distinct l x l cells."""
+        cells = np.unique(np.floor(self.inliers_of(T) / self.target_field.length_scale), axis=0)
+        observed = self.target.gradient_map.mask.sum() * self.target.gradient_map.resolution**2
+        radius = inlier_radius_of(self.settings, self.target.gradient_map)
+        probability = min(np.pi * radius**2 / observed, 1.0)
+        return surprisal_of_inliers(len(cells), len(self.associations), probability)
 
     def participation(self, T: Array) -> float:
         """Share of the shared ground that the agreement at a pose rests on."""

@@ -8,8 +8,11 @@ logarithm of that probability, in nats.
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import betainc
 
 from terrainloop.config import Calibration
+
+LN_2 = float(np.log(2.0))
 
 
 def surprisal_of_correlation(
@@ -37,6 +40,40 @@ def surprisal_of_field(correlation: float, samples: float, calibration: Calibrat
     """Surprisal of the agreement of two fields: that of the correlation, with the calibrated tail."""
     squared = max(correlation, 0.0) ** 2
     return calibration.tail * float(surprisal_of_correlation(squared, samples, calibration))
+
+
+def surprisal_of_inliers(inliers: int, associations: int, probability: float) -> float:
+    """Surprisal of a number of keypoint associations that agree with a pose they did not propose.
+
+    Parameters
+    ----------
+    inliers : int
+        Number n of independent inliers.
+    associations : int
+        Number M of all associations.
+    probability : float
+        Probability p that one association agrees by chance: the area within the inlier radius over the
+        observed area.
+
+    Returns
+    -------
+    float
+        Minus the natural logarithm of the binomial tail P(n or more of M).
+    """
+    if inliers <= 0:
+        return 0.0
+    tail = float(betainc(inliers, associations - inliers + 1, probability))
+    return -float(np.log(max(tail, np.finfo(float).tiny)))
+
+
+def combined_surprisal(field: float, inliers: float) -> float:
+    """Surprisal of the field alone, or of field and inliers together, whichever is larger.
+
+    The sum x of two independent surprisals has tail probability exp(-x)(1 + x) (Fisher's method, 1932);
+    choosing the better of two tests costs a factor of two.
+    """
+    together = field + inliers
+    return max(field, together - float(np.log1p(together)), LN_2) - LN_2
 
 
 def log_num_tests(tried: float, others: NDArray[np.floating], calibration: Calibration) -> float:
