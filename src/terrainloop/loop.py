@@ -55,8 +55,7 @@ class LoopCandidate(ReadOnlyArrays):
         Covariance of (x, y, z, roll, pitch, yaw), the parameters of `T_local`, in metres and radians. NaN
         where no transform could be estimated. `information` converts it for GTSAM and g2o.
     inliers : int
-        Associations that agree with the transform (n of Algorithm 1); counted for loops only where a run
-        decides by evidence.
+        Associations that agree with the transform (n of Algorithm 1).
     ssd : float
         Weighted sum of squared gradient differences (h of Algorithm 1), m^-4.
     ssd_ratio : float
