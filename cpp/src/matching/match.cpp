@@ -77,6 +77,14 @@ std::string fixed(double value, int decimals) {
   return text.str();
 }
 
+/// Whether a rival is the place of T, or on the flank of its peak: a thorough refinement arrives there.
+bool leads_to(const Pair& pair, const Matrix3d& rival, const Matrix3d& T) {
+  if (pair.same_place(rival, T)) return true;
+  const std::optional<Refinement> refinement =
+      Refinement::of(pair.source, pair.target, rival, pair.calibration, kThorough);
+  return refinement && pair.same_place(refinement->T_target_source(), T);
+}
+
 /// Which poses explain a pair as well as the best, in words.
 std::string ambiguity(const Pair& pair, const Hypothesis& best, const std::vector<Hypothesis>& rivals) {
   const Matrix3d& T = best.T_target_source;
@@ -118,7 +126,7 @@ std::string objection_to(const Pair& pair, const Weighed& weighed,
   const double rivalling = weighed.rivalling(calibration);
   std::vector<Hypothesis> equal;
   for (const Hypothesis& rival : weighed.rivals)
-    if (rival.surprisal > rivalling && !pair.same_place(rival.T_target_source, T)) equal.push_back(rival);
+    if (rival.surprisal > rivalling && !leads_to(pair, rival.T_target_source, T)) equal.push_back(rival);
   if (!equal.empty()) return ambiguity(pair, best, equal);
   if (!refinement || !pair.same_place(refinement->T_target_source(), T))
     return "undetermined, the refinement converges elsewhere";

@@ -6,7 +6,7 @@ import numpy as np
 
 from terrainloop.config import Calibration, Settings
 from terrainloop.entry import MapEntry
-from terrainloop.geometry import inverse, rotation_about, transform, yaw_of
+from terrainloop.geometry import Array, inverse, rotation_about, transform, yaw_of
 from terrainloop.loop import NO_EVIDENCE, LoopCandidate
 from terrainloop.matching.hypotheses import Hypothesis, Pair, propose_hypotheses
 from terrainloop.matching.lift import PlanarPrecision, lift_to_se3, pose_in_se3
@@ -117,7 +117,7 @@ def _objection(pair: Pair, weighed: Weighed, refinement: Refinement | None) -> s
         return f"uneven agreement, it rests on {participation:.0%} of the shared ground"
     T, rivalling = best.T_target_source, weighed.rivalling(calibration)
     equal = [
-        h for h in weighed.rivals if h.of_field > rivalling and not pair.same_place(h.T_target_source, T)
+        h for h in weighed.rivals if h.of_field > rivalling and not _leads_to(pair, h.T_target_source, T)
     ]
     if equal:
         return _ambiguity(pair, best, equal)
@@ -129,6 +129,14 @@ def _objection(pair: Pair, weighed: Weighed, refinement: Refinement | None) -> s
     if any(pair.weigh(T).of_field > rivalling for T in slid):
         return "undetermined, the match slides"
     return ""
+
+
+def _leads_to(pair: Pair, rival: Array, T: Array) -> bool:
+    """Whether a rival is the place of T, or on the flank of its peak: a thorough refinement arrives there."""
+    if pair.same_place(rival, T):
+        return True
+    refinement = refine(*pair.maps, rival, pair.settings.calibration)
+    return refinement is not None and pair.same_place(refinement.T_target_source, T)
 
 
 def _ambiguity(pair: Pair, best: Hypothesis, rivals: list[Hypothesis]) -> str:
