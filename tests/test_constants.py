@@ -15,7 +15,7 @@ from terrainloop.config import Calibration
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "calibration.md"
 PACKAGE = Path(terrainloop.__file__).parent
-DETECTION = ("detection/mission", "detection/detector", "detection/sensor_pattern")
+DETECTION = tuple(f"detection/{name}" for name in ("mission", "detector", "flat_field", "sensor_pattern"))
 # Where any number changes results. Limits on input, formats and drawings are not of that kind.
 PYTHON = ("features", "field", "gradient_map", "loop", "matching", "gp", *DETECTION, "evaluation")
 CORE = ("cpp/src", "cpp/include")

@@ -367,6 +367,28 @@ def test_what_is_no_submap_is_refused(strict, submap):
         LoopDetector(strict).add(submap)
 
 
+@pytest.mark.parametrize(
+    "odometry",
+    [
+        np.eye(4).astype(object),
+        np.eye(4).astype(str),
+        np.eye(3),
+        np.eye(4).tolist(),
+        np.zeros((4, 4)),
+        np.diag([1.0, 1.0, -1.0, 1.0]),
+        np.diag([2.0, 1.0, 1.0, 1.0]),
+        np.eye(4) + np.eye(4)[:, [3, 0, 1, 2]],
+        se3(1e12, 0, 0, 0, 0, 0),
+        se3(np.nan, 0, 0, 0, 0, 0),
+    ],
+)
+def test_what_is_no_rigid_odometry_is_refused(submaps, strict, odometry):
+    detector = LoopDetector(strict)
+    with pytest.raises(TerrainLoopError, match="odometry as a rigid transform"):
+        detector.add(next(iter(submaps.values())), odometry)
+    assert not detector.entries
+
+
 def test_submaps_without_a_name_are_numbered(submaps, strict):
     detector = LoopDetector(strict, parameters=PARAMETERS)
     for name in ("000000", "000001"):

@@ -338,6 +338,7 @@ def test_max_false_loops_is_for_all_pairs(world):
         assert f"{allowed:g} allowed" in refused.reason
     assert compare(*submaps, with_match(STRICT, max_false_loops=10 ** (-score / 2)))
     assert not compare(*submaps, with_match(STRICT, max_false_loops=0.9 * 10**-score))
+    assert not compare(*submaps, with_match(STRICT, max_false_loops=1e-300), pairs=1e100)
 
 
 def test_chance_is_reckoned_for_all_pairs(world):

@@ -113,12 +113,14 @@ def test_no_process_at_all_is_an_error(monkeypatch):
         list(map_in_processes(process_of, 4, 3, lost))
 
 
-def test_a_script_without_a_guard_gets_an_error_instead_of_broken_results(tmp_path):
+@pytest.mark.parametrize("size", [1, 10_000_000])
+def test_a_script_without_a_guard_gets_an_error_instead_of_broken_results(tmp_path, size):
+    """The larger task does not fit in the pipe to a process that ends before it reads."""
     script = tmp_path / "unguarded.py"
     script.write_text(
-        "import os\n"
+        "from functools import partial\n"
         "from terrainloop.detection.workers import map_in_processes\n"
-        "print(list(map_in_processes(str, 4, 2, repr)))\n"
+        f"print(list(map_in_processes(partial(max, {size} * ' '), 4, 2, repr)))\n"
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 1

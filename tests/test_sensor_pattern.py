@@ -11,9 +11,10 @@ from conftest import World, map_of
 from terrainloop.config import Settings
 from terrainloop.detection import sensor_pattern
 from terrainloop.detection.detector import LoopDetector
+from terrainloop.detection.flat_field import MIN_SUBMAPS
 from terrainloop.detection.mission import detect_mission
 from terrainloop.detection.run import Run
-from terrainloop.detection.sensor_pattern import MIN_SUBMAPS, SensorPatterns
+from terrainloop.detection.sensor_pattern import SensorPatterns, hull_overlap
 from terrainloop.entry import MapEntry
 from terrainloop.geometry import se2, se3, transform, yaw_of
 from terrainloop.io.clouds import write_cloud
@@ -44,8 +45,13 @@ def entry_of(
     session="",
     relief=1.0,
     sensor=0,
+    frame=None,
+    with_hull=False,
 ):
-    """A submap of the world of a seed, at a place of it, with the pattern of the sensor."""
+    """A submap of the world of a seed, at a place of it, with the pattern of the sensor.
+
+    Its frame is that of the sensor, or one in which the sensor is at a pose (x, y, 0 or pi).
+    """
     index = seed if index is None else index
     to_world, rng = se2(*where, turn), np.random.default_rng(index)
 
@@ -55,8 +61,14 @@ def entry_of(
         slope = relief * slope @ to_world[:2, :2] + of_sensor[1] + rng.normal(0, noise, slope.shape)
         return relief * height + of_sensor[0], slope
 
+    x, y, yaw = (0.0, 0.0, 0.0) if frame is None else frame
+    about_middle = se2(0.0, -0.1, 0.0) @ se2(0.0, 0.0, yaw) @ se2(0.0, 0.1, 0.0)
+    gradient_map = map_of(ground, about_middle)
+    gradient_map = replace(gradient_map, origin=(x - 2.0, y - 2.5))
+    corners = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.8], [0.0, 4.8]]) + gradient_map.origin
     record = SubmapRecord(f"{index}", float(index), 1000, "ok", session=session)
-    return MapEntry.of(record, map_of(ground), SETTINGS)
+    record = replace(record, hull=corners) if with_hull else record
+    return MapEntry.of(record, gradient_map, SETTINGS)
 
 
 def cleaned(entries):
@@ -199,7 +211,8 @@ def at_poses(entries, positions):
 def test_a_rover_that_stands_still_sees_its_ground_in_common():
     same = [entry_of(0, noise=0.05, index=k) for k in range(COUNT)]
     still = at_poses(same, np.random.default_rng(0).normal(0, 0.1, (COUNT, 2)))
-    assert cleaned(still)[1] == ()
+    came_from_afar = at_poses([entry_of(1, index=COUNT)], [(20.0, 0.0)])
+    assert cleaned([*came_from_afar, *still])[1] == ()
     driving = at_poses(same, np.c_[10.0 * np.arange(COUNT), np.zeros(COUNT)])
     assert "loops of a vehicle that stood still need its odometry" in cleaned(driving)[1][0]
 
@@ -266,13 +279,16 @@ def test_reasons_name_the_pattern_that_was_subtracted(biased):
 
 def test_loops_that_a_pattern_may_explain_wait_for_other_submaps():
     def explained(entries):
-        (pair,) = online(entries)[0]
-        return "a pattern fixed to the sensor may explain it" in pair.reason, bool(pair)
+        pairs, warnings = online(entries)
+        told = "a pattern fixed to the sensor may explain it" in pairs[-1].reason
+        assert told == any("1 would-be loops were refused" in words for words in warnings)
+        return told, bool(pairs[-1])
 
     same = [entry_of(0, noise=0.05, index=k) for k in range(2)]
     assert explained(same) == (True, False)
-    assert explained(at_poses(same, [(0.0, 0.0), (0.1, 0.0)])) == (False, True)
-    assert explained(at_poses(same, [(0.0, 0.0), (9.0, 0.0)])) == (True, False)
+    from_afar = [entry_of(1, index=2), *same]
+    assert explained(at_poses(from_afar, [(20.0, 0.0), (0.0, 0.0), (0.1, 0.0)])) == (False, True)
+    assert explained(at_poses(from_afar, [(20.0, 0.0), (0.0, 0.0), (9.0, 0.0)])) == (True, False)
     copies = [same[0], replace(same[0], record=same[1].record)]
     assert explained(copies) == (False, True)
     elsewhere = [same[0], entry_of(0, where=(1.5, 1.0), noise=0.05, index=1)]
@@ -297,7 +313,7 @@ def test_another_sensor_is_not_trusted_at_the_identity_after_a_pattern_was_found
     second = [entry_of(seed, 0.03, noise=0.02, relief=0.1, sensor=1) for seed in (8, 9)]
     pairs, _ = online([*first, *second])
     assert not any(pairs)
-    assert "explains it, the two agree in the frame of the sensor" in pairs[-1].reason
+    assert "explains it, the two agree in the same part of its view" in pairs[-1].reason
     assert "was subtracted" not in pairs[-1].reason
 
 
@@ -310,10 +326,77 @@ def test_other_submaps_refute_a_pattern():
 def test_a_sensor_that_takes_turns_with_another_makes_no_loop():
     """Their mean is no pattern, but submaps of either agree among themselves at the identity."""
     entries = [entry_of(seed, 0.03, noise=0.02, relief=0.1, sensor=seed % 2) for seed in range(10)]
-    pairs, warnings = online(entries)
-    assert warnings == ()
+    pairs, (warning,) = online(entries)
+    assert "would-be loops were refused" in warning
     assert not any(pairs)
-    assert any("explains it, 3 other submaps agree at this pose too" in pair.reason for pair in pairs)
+    assert any("explains it, 3 other submaps agree there too" in pair.reason for pair in pairs)
+
+
+FRAMES = {
+    "mown, back and forth": lambda k: (0.0, 0.0, np.pi * (k % 2)),
+    "of the ground": lambda k: (20.0 * k, 5.0 * k, np.pi * (k % 2)),
+    "UTM": lambda k: (5e5 + 20.0 * k, 4.2e6, np.pi * (k % 2)),
+}
+
+
+@pytest.mark.parametrize("frame_of", FRAMES.values(), ids=FRAMES)
+def test_a_pattern_is_found_in_the_view_where_frames_are_not_of_the_sensor(frame_of):
+    entries = [
+        entry_of(seed, 0.03, noise=0.02, relief=0.1, frame=frame_of(seed), with_hull=True)
+        for seed in range(10)
+    ]
+    pairs, (warning,) = online(entries)
+    assert not any(pairs)
+    assert sum("explains it" in pair.reason for pair in pairs) > 20
+    assert "would-be loops were refused: they lie where a pattern" in warning
+
+
+def test_in_the_view_of_a_sensor_two_or_three_submaps_decide_nothing():
+    entries = [
+        entry_of(seed, 0.03, noise=0.02, relief=0.1, frame=(20.0 * seed, 0.0, 0.0), with_hull=True)
+        for seed in range(3)
+    ]
+    pairs, _ = online(entries)
+    assert not any(pairs)
+    assert all("too few other submaps tell" in pair.reason for pair in pairs)
+
+
+def test_a_revisit_in_the_same_view_is_found_among_other_places():
+    frames = [*((20.0 * k, 0.0, 0.0) for k in range(6)), (200.0, 3.0, np.pi)]
+    entries = [
+        entry_of(seed, noise=0.02, index=k, frame=frame, with_hull=True)
+        for k, (seed, frame) in enumerate(zip([*range(6), 0], frames, strict=True))
+    ]
+    pairs, warnings = online(entries)
+    assert [(pair.source, pair.target) for pair in pairs if pair] == [("6", "0")]
+    assert warnings == ()
+
+
+ODOMETRY = {
+    "zeros": lambda k: (0.0, 0.0),
+    "degrees": lambda k: (14.99 + 1e-4 * k, 37.7),
+    "a few centimetres": lambda k: (0.05 * np.cos(k), 0.05 * np.sin(k)),
+}
+
+
+@pytest.mark.parametrize("position_of", ODOMETRY.values(), ids=ODOMETRY)
+@pytest.mark.parametrize("frame", [None, (20.0, 5.0, 0.0)])
+def test_no_odometry_makes_a_loop_of_a_pattern(position_of, frame):
+    entries = [
+        entry_of(seed, 0.03, noise=0.02, relief=0.1, frame=frame, with_hull=True) for seed in range(10)
+    ]
+    pairs, warnings = online(at_poses(entries, [position_of(k) for k in range(10)]))
+    assert not any(pairs)
+    assert warnings
+
+
+def test_overlap_of_two_views_is_that_of_their_hulls():
+    box = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 2.0], [0.0, 2.0]])
+    far = np.array([5e5, 4.2e6])
+    assert hull_overlap(box, box) == pytest.approx(1.0)
+    assert hull_overlap(box + far + [1.0, 0.0], box + far) == pytest.approx(3.0 / 5.0, abs=1e-3)
+    assert hull_overlap(box[[2, 3, 0, 1]], box + 9.0) == 0.0
+    assert hull_overlap(np.empty((0, 2)), box) == 0.0
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,9 @@ from terrainloop.errors import TerrainLoopError
 
 Array = NDArray[np.float64]
 
+MAX_COORDINATE = 1e9  # metres; beyond it a coordinate is an error, not a place on a planet
+MAX_SKEW = 1e-2  # largest entry of R R' - I that rounded digits explain
+
 
 def se2(x: float, y: float, yaw: float) -> Array:
     """SE(2) transform (3, 3) from a translation in metres and a yaw in radians."""
@@ -64,6 +67,16 @@ def inverse(T: Array) -> Array:
     result[:-1, :-1] = R.T
     result[:-1, -1] = -R.T @ t
     return result
+
+
+def is_rigid(T: Array) -> bool:
+    """Whether a matrix (4, 4) is a rotation and a translation with finite, plausible coordinates."""
+    if T.shape != (4, 4) or not (np.abs(T) <= MAX_COORDINATE).all():
+        return False
+    R = T[:3, :3]
+    if not (np.abs(R) <= 1 + MAX_SKEW).all() or (T[3] != (0.0, 0.0, 0.0, 1.0)).any():
+        return False
+    return bool((np.abs(R @ R.T - np.eye(3)) <= MAX_SKEW).all() and np.linalg.det(R) > 0)
 
 
 def translation(offset: ArrayLike) -> Array:

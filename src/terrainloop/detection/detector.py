@@ -13,7 +13,7 @@ from terrainloop.detection.allowance import pairs_equivalent, plausible_by_odome
 from terrainloop.detection.sensor_pattern import SensorPatterns
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
-from terrainloop.geometry import Array
+from terrainloop.geometry import Array, is_rigid
 from terrainloop.gp.hyperparameters import FitOptions, fit_hyperparameters, fit_noise
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.gp.training import TrainingData, detrend
@@ -143,7 +143,9 @@ class LoopDetector:
             If the name is taken or no map can be made; the detector is then as it was.
         """
         _require(isinstance(submap, Submap), "a Submap", submap)
-        _require(odometry is None or _is_pose(odometry), "a finite (4, 4) odometry or None", odometry)
+        _require(
+            odometry is None or _is_pose(odometry), "odometry as a rigid transform (4, 4), or None", odometry
+        )
         with self._adding:
             query = map_submap(
                 submap, self.settings, self.parameters, odometry=odometry, workers=self.workers
@@ -193,9 +195,10 @@ class LoopDetector:
         mirrors = self._mirror_images(source, targets)
         null = MissionNull.of([*self.null_scores, *mirrors.values()], self.settings.calibration)
         decided = [
-            patterns.judge(by_mission_null(candidate, null, self.settings, among), query, target)
-            for candidate, among, target in zip(candidates, pairs, stored, strict=True)
+            by_mission_null(candidate, null, self.settings, among)
+            for candidate, among in zip(candidates, pairs, strict=True)
         ]
+        decided = patterns.judge(decided, query, stored)
         self.null_scores += [score for index, score in mirrors.items() if not decided[index]]
         return with_mission_warp(decided, self.settings.calibration, earlier=self.loops)
 
@@ -221,7 +224,7 @@ def _is_count(value: object) -> bool:
 
 
 def _is_pose(value: object) -> bool:
-    return isinstance(value, np.ndarray) and value.shape == (4, 4) and bool(np.isfinite(value).all())
+    return isinstance(value, np.ndarray) and value.dtype.kind in "iuf" and is_rigid(value.astype(float))
 
 
 def _is_finite(value: object) -> bool:

@@ -164,7 +164,6 @@ def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -
         patterns = SensorPatterns(run.settings, entries)
         for words in patterns.warnings:
             logger.warning("%s", words)
-        run = replace(run, warnings=patterns.warnings)
         scores = sample_null(
             [patterns.cleaned(entry) for entry in entries],
             run.settings,
@@ -196,7 +195,8 @@ def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -
         )
         run = replace(run, complete=False)
     run = tally.of(run)
-    return replace(run, loops=tuple(with_mission_warp(run.loops, run.settings.calibration)))
+    loops = tuple(with_mission_warp(run.loops, run.settings.calibration))
+    return replace(run, loops=loops, warnings=detector.warnings)
 
 
 @contextmanager

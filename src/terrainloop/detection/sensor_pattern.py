@@ -1,76 +1,37 @@
-"""Patterns fixed to the sensor: found as what submaps of different places have in common, and removed.
+"""Patterns fixed to the sensor: subtracted from submaps, and the loops that one explains refused.
 
-Ground does not recur at one place of a submap's own frame; a disparity bias of a camera, the range errors of
-a LiDAR's rings or parts of the rover do. As a flat field is in photography, the mean gradient of the other
-submaps, each in its own frame, is what the sensor adds; it is subtracted from the maps where it is
-significant. What remains of it is looked for in every loop closure: a pose at which submaps of other places
-agree too is that of a pattern.
+What remains of a pattern, or cannot be told from ground yet, is looked for in every loop closure: a pose at
+which submaps of other places agree too, or one that lays the same part of the sensor's view upon itself, is
+that of a pattern.
 """
 
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, islice
+from functools import cached_property
+from itertools import islice
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from terrainloop.config import Settings
+from terrainloop.detection.flat_field import MIN_COVER, MIN_SUBMAPS, FlatField, SensorPattern, centred, is_far
 from terrainloop.entry import MapEntry
-from terrainloop.geometry import Array, inverse, se2, yaw_of
+from terrainloop.geometry import Array, inverse, se2, transform, yaw_of
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.overlay import Agreement, agreement_at
 
 logger = logging.getLogger(__name__)
 
-MIN_SUBMAPS = 4  # that a mean is taken of
-MIN_COVER = 0.67  # of the submaps that see a pixel: fewer, and the frame is that of the ground
-MIN_SHARE = 0.05  # of the gradients' energy: less does no harm (docs/matching.md, section 3)
-SIGNIFICANT = 5.0  # standard deviations of the mean squared significance
-WINDOW = 2.0  # length scales over which the significance of the mean is averaged
-MAX_PIXELS = 4  # times the largest map, that frames laid over each other may take
 SMOOTHEST = 0.25  # of the submaps, which weigh the same; rougher ones weigh less
-TYPICAL = 0.5  # of the share, that the median pair has in common: less, and it is ground that some share
-PRESENT = 0.5  # of the pattern, that a submap must have: with less it is of another sensor
 PERIOD = 40  # submaps after which a pattern is measured anew
+SAME_VIEW = 0.7  # intersection over union of two footprints that are one view of the sensor
 MIN_SUPPORT = 0.4  # of the correlation of a loop, at which another submap agrees with both of its submaps too
 MIN_SUPPORTERS = 2  # submaps that have to
-EXPLAINED = 0.3  # share of the other submaps that agree with both, at which a pattern explains a loop
+EXPLAINED = 0.3  # share of the other submaps that agree as well, at which a pattern explains a loop
 MAX_OTHERS = 20  # submaps that a loop is held against
-MAX_PAIRS = 300  # that the median is taken of
-
-
-@dataclass(frozen=True)
-class SensorPattern:
-    """What submaps have in common in their own frames.
-
-    Attributes
-    ----------
-    share : float
-        Of the energy of the gradients, 0 to 1.
-    submaps : int
-        Number of submaps it was measured on.
-    """
-
-    share: float
-    submaps: int
-
-    @property
-    def _size(self) -> str:
-        return f"{self.share:.0%} of the slopes of {self.submaps} submaps"
-
-    @property
-    def subtracted(self) -> str:
-        """What the reason of a pair says."""
-        return f"a pattern fixed to the sensor ({self._size}) was subtracted"
-
-    def __str__(self) -> str:
-        return (
-            f"a pattern fixed to the sensor makes up {self._size}; it was subtracted before matching: "
-            "calibrate the sensor, or mask what it sees of the vehicle; loops of a vehicle that stood still "
-            "need its odometry"
-        )
 
 
 class SensorPatterns:
@@ -87,6 +48,8 @@ class SensorPatterns:
 
     def __init__(self, settings: Settings, entries: Sequence[MapEntry] = ()) -> None:
         self.settings = settings
+        self.refused = 0  # loops that a pattern explains, or may explain
+        self._seen_in_view = False  # whether other submaps agreed with a loop as a pattern makes them
         self._submaps: dict[str, _Submap] = {}
         self._sessions: dict[str, _Session] = {}
         for entry in entries:
@@ -99,12 +62,17 @@ class SensorPatterns:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What was found, in words: for each session the strongest pattern."""
-        return tuple(
+        """What was found, in words: for each session the strongest pattern; how many loops were refused."""
+        found = [
             f"{name}: {session.strongest}" if name else str(session.strongest)
             for name, session in self._sessions.items()
             if session.strongest is not None
+        ]
+        refused = (
+            f"{self.refused} would-be loops were refused: they lie where a pattern of the sensor would be; "
+            "if the vehicle stood still or came back to the same spot, give its odometry"
         )
+        return (*found, refused) if self.refused else tuple(found)
 
     def add(self, entry: MapEntry) -> None:
         """Another submap; nothing happens if it is known."""
@@ -126,85 +94,140 @@ class SensorPatterns:
         """A submap that was added, without the pattern of its sensor; as it is if there is none."""
         return self._submaps[entry.id].cleaned
 
-    def judge(self, candidate: LoopCandidate, source: MapEntry, target: MapEntry) -> LoopCandidate:
-        """A candidate, rejected if a pattern explains it; its reason names what was subtracted."""
-        pair = [self._submaps[entry.id] for entry in (source, target)]
-        if candidate and (objection := self._objection(candidate, *pair)):
-            candidate = candidate.rejected(f"{objection}: {candidate.reason}")
-        removed = [submap.removed for submap in pair if submap.removed is not None]
-        if removed:
-            strongest = max(removed, key=lambda pattern: pattern.share)
-            candidate = replace(candidate, reason=f"{candidate.reason}; {strongest.subtracted}")
-        return candidate
+    def judge(
+        self, candidates: Sequence[LoopCandidate], query: MapEntry, stored: Sequence[MapEntry]
+    ) -> list[LoopCandidate]:
+        """Candidates of a query, rejected where a pattern explains them; reasons name what was subtracted."""
+        source = self._submaps[query.id]
+        pairs = [
+            _Pair.of(candidate, source, self._submaps[entry.id])
+            for candidate, entry in zip(candidates, stored, strict=True)
+        ]
+        return [self._judged(pair, pairs) for pair in pairs]
 
     def _session_of(self, entry: MapEntry) -> "_Session":
         return self._sessions.setdefault(entry.record.session, _Session([]))
 
     def _store(self, entry: MapEntry) -> str:
+        session = self._session_of(entry)
+        if session.ids and not session.left:
+            first = self._submaps[session.ids[0]].entry
+            session.left = entry.field.radius < _distance(first, entry) < np.inf
         self._submaps[entry.id] = _Submap(entry, entry, _energy(entry.gradient_map), None)
         return entry.id
 
     def _measure(self, session: "_Session", ids: Sequence[str], cleaned: Sequence[str]) -> None:
         """Measure the pattern of a session on some of its submaps, and clean some."""
         submaps = [self._submaps[name] for name in ids]
-        members = _distinct([submap.entry for submap in submaps])
+        members = self._distinct([submap.entry for submap in submaps])
         energies = np.array([self._submaps[entry.id].energy for entry in members])
-        session.stack, session.pattern = None, None
+        session.flat_field, session.pattern = None, None
         if len(members) > MIN_SUBMAPS:
             least = max(float(np.quantile(energies, SMOOTHEST)), 1e-30)
-            stack = _Stack.of(members, 1.0 / np.maximum(energies, least))
-            session.pattern = None if stack is None else stack.pattern()
+            flat_field = FlatField.of(members, 1.0 / np.maximum(energies, least))
+            session.pattern = None if flat_field is None else flat_field.pattern()
         if session.pattern is not None:
-            session.stack = stack
+            session.flat_field = flat_field
             session.strongest = max(filter(None, [session.strongest, session.pattern]), key=lambda p: p.share)
         self._clean(session, cleaned)
 
+    def _distinct(self, entries: Iterable[MapEntry]) -> list[MapEntry]:
+        """The submaps that may show different places: no copies, and none near another by odometry."""
+        distinct: list[MapEntry] = []
+        for entry in entries:
+            if not any(_same_cloud(entry, other) or self._near(entry, other) for other in distinct):
+                distinct.append(entry)
+        return distinct
+
     def _clean(self, session: "_Session", ids: Sequence[str]) -> None:
         for name in ids:
-            submap, stack = self._submaps[name], session.stack
-            entry = submap.entry if stack is None else stack.clean(submap.entry, self.settings)
+            submap, flat_field = self._submaps[name], session.flat_field
+            entry = submap.entry if flat_field is None else flat_field.clean(submap.entry, self.settings)
             removed = session.pattern if entry is not submap.entry else None
             self._submaps[name] = replace(submap, cleaned=entry, removed=removed)
 
-    def _objection(self, candidate: LoopCandidate, source: "_Submap", target: "_Submap") -> str:
-        """Why a loop is none, in words: submaps of other places agree with both at its pose as well."""
-        T = candidate.T_target_source
-        near = self.settings.calibration.min_separation * source.entry.field.length_scale
-        if _same_cloud(source.entry, target.entry) or _as_by_odometry(T, source.entry, target.entry, near):
+    def _judged(self, pair: "_Pair", of_query: "Sequence[_Pair]") -> LoopCandidate:
+        candidate = pair.candidate
+        if candidate and (objection := self._objection(pair, of_query)):
+            self.refused += 1
+            candidate = candidate.rejected(f"{objection}: {candidate.reason}")
+        removed = [submap.removed for submap in (pair.source, pair.target) if submap.removed is not None]
+        if not removed:
+            return candidate
+        strongest = max(removed, key=lambda pattern: pattern.share)
+        return replace(candidate, reason=f"{candidate.reason}; {strongest.subtracted}")
+
+    def _objection(self, pair: "_Pair", of_query: "Sequence[_Pair]") -> str:
+        """Why a loop is none, in words: other submaps agree with it as a pattern would."""
+        if _same_cloud(pair.source.entry, pair.target.entry):
             return ""
-        pose = se2(T[0, 3], T[1, 3], yaw_of(T))
-        agreement = agreement_at(source.entry.field, target.entry.field, pose)
-        energy = max(source.energy, target.energy)
-        total, supporting, count = 0.0, 0.0, 0
-        for other in self._others(source.entry, target.entry):
-            # On rough ground a pattern disappears: such submaps can neither show nor refute it.
-            weight = min(1.0, energy / max(other.energy, 1e-30))
-            total += weight
-            if _supports(pose, source.entry, other.entry, target.entry, agreement):
-                supporting, count = supporting + weight, count + 1
-        if count >= MIN_SUPPORTERS and supporting >= EXPLAINED * total:
-            return f"a pattern fixed to the sensor explains it, {count} other submaps agree at this pose too"
-        at_identity = candidate.overlap >= MIN_COVER and np.hypot(*T[:2, 3]) <= near
-        if not at_identity or _is_far(source.entry.gradient_map):
+        others = self._elsewhere(pair, of_query)
+        agree = self._agree(pair, others)
+        weight = np.array([pair.weight_of(other.target) for other in others])
+        if agree.sum() >= MIN_SUPPORTERS and weight @ agree >= EXPLAINED * weight.sum():
+            self._seen_in_view = True
+            return f"a pattern fixed to the sensor explains it, {agree.sum()} other submaps agree there too"
+        at_identity = pair.is_at_identity(self._near_by(pair.source))
+        if not (at_identity or pair.same_view) or self._as_by_odometry(pair):
             return ""
-        if any(session.strongest is not None for session in self._sessions.values()):
-            return "a pattern fixed to the sensor explains it, the two agree in the frame of the sensor"
-        if total - supporting < MIN_SUBMAPS:
+        if (at_identity and self._found_any) or (pair.same_view and self._seen_in_view):
+            return "a pattern fixed to the sensor explains it, the two agree in the same part of its view"
+        if weight @ ~agree < MIN_SUBMAPS:
             return "a pattern fixed to the sensor may explain it, too few other submaps tell"
         return ""
 
-    def _others(self, source: MapEntry, target: MapEntry) -> "list[_Submap]":
-        """Up to `MAX_OTHERS` submaps that, as far as odometry says, show neither place."""
-        submaps = list(self._submaps.values())
-        shuffled = np.random.default_rng(self.settings.seed).permutation(len(submaps))
+    @property
+    def _found_any(self) -> bool:
+        return any(session.strongest is not None for session in self._sessions.values())
+
+    def _elsewhere(self, pair: "_Pair", of_query: "Sequence[_Pair]") -> "list[_Pair]":
+        """Up to `MAX_OTHERS` pairs of the query with submaps that show neither place, by odometry if any."""
+        shuffled = np.random.default_rng(self.settings.seed).permutation(len(of_query))
         elsewhere = (
-            submaps[index]
-            for index in shuffled
-            if not any(
-                submaps[index].entry.id == e.id or _near(submaps[index].entry, e) for e in (source, target)
-            )
+            other
+            for other in (of_query[index] for index in shuffled)
+            if other is not pair
+            and not any(self._near(other.target.entry, e.entry) for e in (pair.source, pair.target))
         )
         return list(islice(elsewhere, MAX_OTHERS))
+
+    def _agree(self, pair: "_Pair", others: "Sequence[_Pair]") -> NDArray[np.bool_]:
+        """Which of other submaps agree with both of a pair at its pose, or with the query in its view."""
+        least = -np.log10(self.settings.calibration.ambiguity_chance)
+        agreement = pair.source.agreement_with(pair.target, pair.pose)
+        return np.array(
+            [
+                (pair.same_view and other.candidate.score >= least and other.same_view)
+                or pair.is_supported_by(other.target, agreement)
+                for other in others
+            ],
+            dtype=bool,
+        )
+
+    def _as_by_odometry(self, pair: "_Pair") -> bool:
+        """Whether odometry puts the middle of the source where the pose of a pair does."""
+        source, target = pair.source.entry, pair.target.entry
+        to_world, from_source = target.record.odometry, source.record.odometry
+        if to_world is None or from_source is None or not self._odometry_tells(source, target):
+            return False
+        expected = _middle(source, inverse(to_world) @ from_source)
+        away = np.hypot(*(expected - transform(pair.pose, source.field.centre)))
+        return bool(away < self._near_by(pair.source))
+
+    def _near(self, a: MapEntry, b: MapEntry) -> bool:
+        """Whether odometry says that two submaps show one place."""
+        return self._odometry_tells(a, b) and _distance(a, b) < a.field.radius
+
+    def _odometry_tells(self, a: MapEntry, b: MapEntry) -> bool:
+        """Whether two submaps have odometry in one frame by which their session left its first place.
+
+        If it did not, as with zeros or degrees in the file, it says nothing against a pattern.
+        """
+        return a.record.session == b.record.session and self._sessions[a.record.session].left
+
+    def _near_by(self, submap: "_Submap") -> float:
+        """Distance within which two poses are one, metres."""
+        return self.settings.calibration.min_separation * submap.entry.field.length_scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,166 +239,70 @@ class _Submap:
     energy: float
     removed: SensorPattern | None
 
+    def agreement_with(self, target: "_Submap", T_target_source: Array) -> Agreement:
+        return agreement_at(self.cleaned.field, target.cleaned.field, T_target_source)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """A query and a stored submap, and the pose (3, 3) at which they were found to agree best."""
+
+    candidate: LoopCandidate
+    source: _Submap
+    target: _Submap
+    pose: Array
+
+    @classmethod
+    def of(cls, candidate: LoopCandidate, source: _Submap, target: _Submap) -> "_Pair":
+        T = candidate.T_local
+        pose = se2(T[0, 3], T[1, 3], yaw_of(T))
+        pose[:2, 2] += candidate.target_origin[:2] - pose[:2, :2] @ candidate.source_origin[:2]
+        return cls(candidate, source, target, pose)
+
+    @cached_property
+    def same_view(self) -> bool:
+        """Whether the pose lays one observed area upon the other, wherever their frames are."""
+        source, target = self.source.entry.record.hull, self.target.entry.record.hull
+        return hull_overlap(transform(self.pose, source), target) >= SAME_VIEW
+
+    def is_at_identity(self, tolerance: float) -> bool:
+        """Whether the pose lays one frame upon the other, and the frames can be those of a sensor."""
+        g = self.source.entry.gradient_map
+        near = np.hypot(*self.pose[:2, 2]) <= tolerance
+        return bool(near and self.candidate.overlap >= MIN_COVER and not is_far(g))
+
+    def is_supported_by(self, other: _Submap, agreement: Agreement) -> bool:
+        """Whether another submap agrees with both at the pose, nearly as well as the two agree."""
+
+        def agrees(a: _Submap, b: _Submap) -> bool:
+            found = a.agreement_with(b, self.pose)
+            enough = found.area >= 0.5 * agreement.area
+            return enough and found.correlation > MIN_SUPPORT * agreement.correlation
+
+        return agrees(self.source, other) and agrees(other, self.target)
+
+    def weight_of(self, other: _Submap) -> float:
+        """What another submap counts: on rough ground it can neither show a pattern nor refute it."""
+        return min(1.0, max(self.source.energy, self.target.energy) / max(other.energy, 1e-30))
+
 
 @dataclass(eq=False)
 class _Session:
-    """Submaps of one sensor: their ids, what they have in common now, and the most that they ever had."""
+    """Submaps of one sensor: their ids, what they have in common now, and the most that they ever had.
+
+    `left` tells whether odometry says that the vehicle left its first place.
+    """
 
     ids: list[str]
-    stack: "_Stack | None" = None
+    left: bool = False
+    flat_field: FlatField | None = None
     pattern: SensorPattern | None = None
     strongest: SensorPattern | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class _Stack:
-    """Centred gradients of submaps, weighted, summed in one frame.
-
-    Attributes
-    ----------
-    members : dict of str to (MapEntry, float)
-        The submaps and their weights, by id.
-    origin, resolution : array (2,), float
-        Of the common frame, metres.
-    sums : array, (9, rows, columns)
-        For each pixel the sums over the submaps that see it, of: 1, w, w^2, w g (2), w^2 g (2), w |g|^2 and
-        w^2 |g|^2, with the gradient g of a submap and its weight w.
-    """
-
-    members: dict[str, tuple[MapEntry, float]]
-    origin: Array
-    resolution: float
-    sums: Array
-
-    @classmethod
-    def of(cls, entries: Sequence[MapEntry], weights: Array) -> "_Stack | None":
-        """The stack, or nothing where the submaps have no common frame or resolution."""
-        maps = [entry.gradient_map for entry in entries]
-        resolution, origin = maps[0].resolution, np.min([m.origin for m in maps], axis=0)
-        ends = np.array([_corner(m, origin, resolution) + m.mask.shape for m in maps])
-        extent = ends.max(axis=0)
-        most = MAX_PIXELS * max(m.mask.size for m in maps)
-        if any(_is_far(m) or m.resolution != resolution for m in maps) or extent.astype(float).prod() > most:
-            return None
-        sums = np.zeros((9, *extent))
-        for m, weight in zip(maps, weights, strict=True):
-            row, column = _corner(m, origin, resolution)
-            rows, columns = m.mask.shape
-            sums[:, row : row + rows, column : column + columns] += _summands(m, weight)
-        members = {entry.id: (entry, float(w)) for entry, w in zip(entries, weights, strict=True)}
-        return cls(members, origin, resolution, sums)
-
-    def pattern(self) -> SensorPattern | None:
-        """What the submaps have in common, if it is more than chance, not negligible, and common to most."""
-        seen = self.sums[0] >= max(MIN_SUBMAPS, MIN_COVER * len(self.members))
-        if not seen.any():
-            return None
-        _, mean, by_chance = _mean(self.sums[:, seen])
-        energy = float((self.sums[7, seen] / self.sums[1, seen]).mean())
-        excess = float(((mean**2).sum(axis=0) - by_chance).mean())
-        window = WINDOW * self._length_scale / self.resolution
-        least = SIGNIFICANT * float(by_chance.mean()) / np.sqrt(max(seen.sum() / window**2, 1.0))
-        if not excess > max(least, MIN_SHARE * energy) or not self._is_typical():
-            return None
-        return SensorPattern(excess / energy, len(self.members))
-
-    def clean(self, entry: MapEntry, settings: Settings) -> MapEntry:
-        """The entry less the mean of the others, shrunk by how much of it chance explains nearby.
-
-        As it is where it has no such pattern: a mission may have several sensors.
-        """
-        g = entry.gradient_map
-        if g.resolution != self.resolution or _is_far(g):
-            return entry
-        _, weight_of_entry = self.members.get(entry.id, (None, 0.0))
-        sums = self._at(g)
-        if weight_of_entry:
-            sums -= _summands(g, weight_of_entry)
-        count, mean, by_chance = _mean(sums)
-        sigma = WINDOW * self._length_scale / g.resolution / 2
-        valid = (count >= max(MIN_SUBMAPS - 1, MIN_COVER * (len(self.members) - 1))).astype(float)
-        square, chance = (
-            cv2.GaussianBlur(image * valid, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-            for image in ((mean**2).sum(axis=0), by_chance)
-        )
-        weight = valid * np.clip(1.0 - chance / np.maximum(square, 1e-30), 0.0, 1.0)
-        of_sensor = weight * mean * g.mask
-        if (_centred(g) * of_sensor).sum() <= PRESENT * (of_sensor**2).sum():
-            return entry
-        x, y = (
-            (image - part).astype(np.float32)
-            for image, part in zip((g.gradient_x, g.gradient_y), weight * mean, strict=True)
-        )
-        return MapEntry.of(entry.record, replace(g, gradient_x=x, gradient_y=y), settings)
-
-    @property
-    def _length_scale(self) -> float:
-        return next(iter(self.members.values()))[0].field.length_scale
-
-    def _at(self, g: GradientMap) -> Array:
-        """The sums on the pixels of a map; zero beyond the common frame."""
-        row, column = _corner(g, self.origin, self.resolution)
-        rows, columns = g.mask.shape
-        sums = np.zeros((9, rows, columns))
-        ends = np.minimum((row + rows, column + columns), self.sums.shape[1:])
-        low = np.maximum((row, column), 0)
-        if (ends > low).all():
-            inside = tuple(slice(a - at, b - at) for a, b, at in zip(low, ends, (row, column), strict=True))
-            sums[:, *inside] = self.sums[:, low[0] : ends[0], low[1] : ends[1]]
-        return sums
-
-    def _is_typical(self) -> bool:
-        """Whether most pairs of submaps have it in common, rather than a few much (ground seen again)."""
-        pairs = list(combinations(self.members.values(), 2))
-        pairs = pairs[:: -(-len(pairs) // MAX_PAIRS)]
-        common = np.array([agreement_at(a.field, b.field, np.eye(3)).correlation for (a, _), (b, _) in pairs])
-        weights = np.array([v * w for (_, v), (_, w) in pairs])
-        order = common.argsort()
-        below = weights[order].cumsum()
-        median = common[order[np.searchsorted(below, 0.5 * below[-1])]]
-        return bool(median > TYPICAL * np.average(common, weights=weights))
-
-
-def _corner(g: GradientMap, origin: Array, resolution: float) -> Array:
-    """Row and column of the first pixel of a map in a frame."""
-    return np.asarray(np.round((np.array(g.origin) - origin) / resolution).astype(int)[::-1])
-
-
-def _summands(g: GradientMap, weight: float) -> Array:
-    """What a map adds to the sums of a `_Stack`."""
-    gradient, seen = _centred(g), g.mask.astype(float)
-    energy = (gradient**2).sum(axis=0)
-    w, v = weight, weight**2
-    return np.stack([seen, w * seen, v * seen, *(w * gradient), *(v * gradient), w * energy, v * energy])
-
-
-def _mean(sums: Array) -> tuple[Array, Array, Array]:
-    """Number of submaps, weighted mean gradient (2, ...) and variance of that mean, from the sums."""
-    count, w, v, energy = sums[0], np.maximum(sums[1], 1e-30), sums[2], sums[8]
-    mean = sums[3:5] / w
-    squares = energy - 2 * (mean * sums[5:7]).sum(axis=0) + (mean**2).sum(axis=0) * v
-    effective = w**2 / np.maximum(v, 1e-30)
-    return count, mean, np.maximum(squares, 0.0) / w**2 / np.maximum(1.0 - 1.0 / effective, 1e-3)
-
-
-def _centred(g: GradientMap) -> Array:
-    """Gradient (2, rows, columns) less its mean, zero where the ground was not observed."""
-    gradient = np.stack([g.gradient_x, g.gradient_y]).astype(float)
-    return (gradient - gradient[:, g.mask].mean(axis=1)[:, None, None] if g.mask.any() else gradient) * g.mask
-
-
 def _energy(g: GradientMap) -> float:
     """Mean square of the gradient about its mean."""
-    return float((_centred(g) ** 2).sum() / max(g.mask.sum(), 1))
-
-
-def _distinct(entries: Iterable[MapEntry]) -> list[MapEntry]:
-    """The submaps that may show different places: no copies, and none near another by odometry."""
-    distinct: list[MapEntry] = []
-    for entry in entries:
-        if not any(_same_cloud(entry, other) or _near(entry, other) for other in distinct):
-            distinct.append(entry)
-    return distinct
+    return float((centred(g) ** 2).sum() / max(g.mask.sum(), 1))
 
 
 def _same_cloud(a: MapEntry, b: MapEntry) -> bool:
@@ -383,31 +310,23 @@ def _same_cloud(a: MapEntry, b: MapEntry) -> bool:
     return np.array_equal(a.gradient_map.gradient_x, b.gradient_map.gradient_x)
 
 
-def _near(a: MapEntry, b: MapEntry) -> bool:
-    """Whether odometry says that two submaps show one place."""
+def _middle(entry: MapEntry, T: Array) -> Array:
+    """Where SE(3) transform takes the middle of a submap, (2,); its height is not known and taken as zero."""
+    return transform(T, np.append(entry.field.centre, 0.0))[:2]
+
+
+def _distance(a: MapEntry, b: MapEntry) -> float:
+    """Between the middles of two submaps by odometry, metres; infinite where it is not known."""
     if a.record.odometry is None or b.record.odometry is None:
-        return False
-    return bool(np.hypot(*(a.record.odometry - b.record.odometry)[:2, 3]) < a.field.radius)
+        return np.inf
+    return float(np.hypot(*(_middle(a, a.record.odometry) - _middle(b, b.record.odometry))))
 
 
-def _is_far(g: GradientMap) -> bool:
-    """Whether the frame of a map cannot be that of a sensor, which is near what it sees."""
-    return bool(g.local_origin.any())
-
-
-def _as_by_odometry(T: Array, source: MapEntry, target: MapEntry, tolerance: float) -> bool:
-    """Whether odometry puts the source where T does, to a tolerance in metres."""
-    to_world, from_source = target.record.odometry, source.record.odometry
-    if to_world is None or from_source is None:
-        return False
-    return bool(np.hypot(*(inverse(to_world) @ from_source - T)[:2, 3]) < tolerance)
-
-
-def _supports(T: Array, source: MapEntry, other: MapEntry, target: MapEntry, pair: Agreement) -> bool:
-    """Whether another submap agrees with both of a pair at its pose, nearly as well as these agree."""
-
-    def agrees(a: MapEntry, b: MapEntry) -> bool:
-        found = agreement_at(a.field, b.field, T)
-        return found.area >= 0.5 * pair.area and found.correlation > MIN_SUPPORT * pair.correlation
-
-    return agrees(source, other) and agrees(other, target)
+def hull_overlap(a: Array, b: Array) -> float:
+    """Intersection over union of two convex polygons (K, 2) and (M, 2), anticlockwise, metres, 0 to 1."""
+    if not len(a) or not len(b):
+        return 0.0
+    middle = b.mean(axis=0)  # single precision is enough about it
+    a, b = ((corners - middle).astype(np.float32) for corners in (a, b))
+    shared, _ = cv2.intersectConvexConvex(a, b)
+    return float(shared / max(cv2.contourArea(a) + cv2.contourArea(b) - shared, 1e-30))

@@ -63,10 +63,10 @@ class _Worker:
         try:
             with _interrupts_blocked():
                 self._process.start()
-                # Large arguments of a process end it with a traceback if this one is killed meanwhile.
-                self.connection.send(task)
         finally:
-            theirs.close()
+            theirs.close()  # else sending to a process that has ended waits for ever
+        # Large arguments of a process end it with a traceback if this one is killed meanwhile.
+        self.connection.send(task)
         self.index: int | None = None
 
     def begin(self, index: int) -> None:

@@ -8,8 +8,8 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from terrainloop.errors import TerrainLoopError
-from terrainloop.evaluation.truth import GroundTruth, is_rigid
-from terrainloop.geometry import Array, inverse, yaw_of
+from terrainloop.evaluation.truth import GroundTruth
+from terrainloop.geometry import Array, inverse, is_rigid, yaw_of
 from terrainloop.record import SubmapRecord
 
 POSITION_TOLERANCE = 1.0  # metres, within the two bounds below

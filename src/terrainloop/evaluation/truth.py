@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.overlap import box_iou, world_boxes
-from terrainloop.geometry import Array
+from terrainloop.geometry import MAX_COORDINATE, Array, is_rigid
 from terrainloop.io.submap_poses import check_upright
 from terrainloop.io.trajectories import Trajectory
 from terrainloop.record import SubmapRecord
 
 MIN_OVERLAP = 0.3  # IoU above which a pair is a true match (paper, section VI-A)
-MAX_COORDINATE = 1e9  # metres; beyond it a coordinate is an error, not a place on a planet
-MAX_SKEW = 1e-2  # largest entry of R R' - I that rounded digits explain
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,13 +136,3 @@ def _check_poses(poses: Array, records: Sequence[SubmapRecord]) -> None:
                 mend="correct that line of the truth",
             )
     check_upright(Trajectory(np.arange(len(poses), dtype=float), np.asarray(poses)), "the truth")
-
-
-def is_rigid(T: Array) -> bool:
-    """Whether a matrix (4, 4) is a rotation and a translation with finite, plausible coordinates."""
-    if T.shape != (4, 4) or not (np.abs(T) <= MAX_COORDINATE).all():
-        return False
-    R = T[:3, :3]
-    if not (np.abs(R) <= 1 + MAX_SKEW).all() or (T[3] != (0.0, 0.0, 0.0, 1.0)).any():
-        return False
-    return bool((np.abs(R @ R.T - np.eye(3)) <= MAX_SKEW).all() and np.linalg.det(R) > 0)

@@ -49,7 +49,7 @@ class Weighed:
         calibration = pair.settings.calibration
         rivals = [h for h in hypotheses if h.agreement.correlation >= calibration.min_correlation]
         log_tests = log_num_tests(pair.found.tried, pair.found.surprisals[1:], calibration)
-        needed = log_tests + float(np.log(pairs / pair.settings.match.max_false_loops))
+        needed = log_tests + float(np.log(pairs) - np.log(pair.settings.match.max_false_loops))
         return cls(max(rivals or hypotheses, key=lambda h: h.surprisal), rivals, log_tests, needed)
 
     @property
