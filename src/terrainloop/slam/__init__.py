@@ -1,0 +1,1 @@
+"""From posed scans to a corrected trajectory: submapping, the pose graph, the second look, the mapper."""
