@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from terrainloop.arrays import ReadOnlyArrays, read_only
 from terrainloop.errors import TerrainLoopError
-from terrainloop.geometry import MAX_COORDINATE
+from terrainloop.geometry import MAX_COORDINATE, is_rigid
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,6 +53,45 @@ class Scan(ReadOnlyArrays):
 
     def __repr__(self) -> str:
         return f"Scan({len(self)} points, stamp {self.stamp:.6f})"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PosedScan(ReadOnlyArrays):
+    """A scan and the pose that odometry gives its sensor.
+
+    Parameters
+    ----------
+    scan : Scan
+    T_world_sensor : array_like, (4, 4)
+        In a world with z up; metres.
+    covariance : array_like, (6, 6), optional
+        Covariance of the odometry's pose as it was published, in the order of ROS: x, y, z and the rotations
+        about the fixed axes x, y, z of the world; metres and radians.
+
+    Raises
+    ------
+    TerrainLoopError
+        If the pose is not rigid, or the covariance of another shape or not finite.
+    """
+
+    scan: Scan
+    T_world_sensor: NDArray[np.float64]
+    covariance: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        pose = _numbers(self.T_world_sensor, "a pose (4, 4)")
+        if not is_rigid(pose):
+            raise _refused("a rigid transform (4, 4)", f"an array of shape {pose.shape} that is none")
+        object.__setattr__(self, "T_world_sensor", read_only(pose))
+        if self.covariance is not None:
+            covariance = _numbers(self.covariance, "a covariance (6, 6)")
+            if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
+                raise _refused("a finite covariance (6, 6)", f"an array of shape {covariance.shape}")
+            object.__setattr__(self, "covariance", read_only(covariance))
+
+    def __repr__(self) -> str:
+        x, y, z = self.T_world_sensor[:3, 3]
+        return f"PosedScan({self.scan!r} at ({x:.2f}, {y:.2f}, {z:.2f}) m)"
 
 
 def _numbers(values: object, expected: str) -> NDArray[np.float64]:

@@ -189,14 +189,14 @@ def _confirmed(names: Sequence[str], stamps: Array) -> Order | None:
     gaps = np.diff(stamps)
     if len(gaps) == 0 or gaps.min() <= 0:
         return None
-    for times, _ in _times(names):
+    for times, _ in times_in_names(names):
         order = np.argsort(times, kind="stable")
         if np.abs(times[order] - stamps).max() <= min(_CLOSE, gaps.min() / 4):
             return [int(i) for i in order]
     return None
 
 
-def _times(names: Sequence[str]) -> Iterator[tuple[Array, bool]]:
+def times_in_names(names: Sequence[str]) -> Iterator[tuple[Array, bool]]:
     """The last number of each name as seconds, in each reading, and whether it surely is not an index."""
     found = [re.findall(f"(?:{_MINUS})?" + _COMPOUND, name) for name in names]
     if not all(found):
@@ -224,7 +224,7 @@ def _check_stamps(names: Sequence[str], stamps: Array) -> None:
     if (steps == 0).any():
         repeated = stamps[int(np.argmax(steps == 0))]
         logger.warning("the stamp %.15g repeats: poses are taken in the order of the lines", repeated)
-    for times, surely in _times(names):
+    for times, surely in times_in_names(names):
         elsewhere = np.isin(np.round(times, 3), np.round(stamps, 3)) & (np.abs(times - stamps) > _CLOSE)
         if surely and 2 * elsewhere.sum() >= len(names):
             at = int(np.argmax(elsewhere))

@@ -3,25 +3,29 @@
 import io
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.io.clouds.arrays import read_npy, read_npz
+from terrainloop.io.clouds.kitti import read_kitti
 from terrainloop.io.clouds.pcd import read_pcd
 from terrainloop.io.clouds.ply import read_ply
 from terrainloop.io.clouds.table import INTENSITY, Columns, Table, check_points
 from terrainloop.io.clouds.text import read_text
 from terrainloop.io.files import as_path, write_whole
+from terrainloop.scan import Scan
 from terrainloop.submap import Submap, as_numbers
 
 logger = logging.getLogger(__name__)
 
-__all__ = ["CLOUD_SUFFIXES", "read_cloud", "read_crs", "write_cloud"]
+__all__ = ["CLOUD_SUFFIXES", "SCAN_SUFFIXES", "read_cloud", "read_crs", "read_scan", "write_cloud"]
+
+Cloud = TypeVar("Cloud")
 
 
 def read_cloud(path: str | Path, stamp: float = 0.0) -> Submap:
@@ -55,21 +59,30 @@ def read_cloud(path: str | Path, stamp: float = 0.0) -> Submap:
         in degrees or feet, a count in a header that differs from what follows.
     """
     path = as_path(path, "a cloud")
-    reader = _reader_for(path)
-    table = Table({})
-    try:
-        with np.errstate(all="ignore"):  # what overflows becomes infinite, and is dropped as such
-            table = reader(path)
-            check_points(max(map(len, table.columns.values()), default=0), path.stat().st_size)
-            points, intensity = _cloud_of(table.columns)
-            for repair in table.repairs:
-                logger.warning("%s: %s", path.stem, repair)
-            return Submap(points, name=path.stem, stamp=stamp, intensity=intensity, repairs=table.repairs)
-    except TerrainLoopError as error:
-        found = "; ".join([f"{path}: {error.found}", *table.repairs])
-        raise TerrainLoopError(expected=error.expected, found=found, mend=error.mend) from error
-    except Exception as error:  # what readers raise on damaged files is not documented
-        raise _damaged(path, error) from error
+
+    def submap_of(points: NDArray[Any], intensity: NDArray[Any] | None, repairs: tuple[str, ...]) -> Submap:
+        return Submap(points, name=path.stem, stamp=stamp, intensity=intensity, repairs=repairs)
+
+    return _read(path, _READERS, submap_of)
+
+
+def read_scan(path: str | Path, stamp: float = 0.0) -> Scan:
+    """Read one scan in the frame of its sensor, from any file that `read_cloud` reads or KITTI's ``.bin``.
+
+    Parameters
+    ----------
+    path : path
+        ``.bin`` holds x, y, z and intensity in little-endian single precision, as KITTI's Velodyne scans.
+    stamp : float
+        Stamp of the scan, seconds.
+
+    Raises
+    ------
+    TerrainLoopError
+        If anything is wrong with the file, which the error names.
+    """
+    path = as_path(path, "a scan")
+    return _read(path, _SCAN_READERS, lambda points, intensity, _: Scan(points, stamp, intensity))
 
 
 def read_crs(path: str | Path) -> int | str | None:
@@ -86,7 +99,7 @@ def read_crs(path: str | Path) -> int | str | None:
         Naming the file, where it cannot be read.
     """
     path = as_path(path, "a cloud")
-    _reader_for(path)
+    _reader_for(path, _READERS)
     if path.suffix.lower() not in (".las", ".laz"):
         return None
     from terrainloop.io.clouds.las import crs_of
@@ -127,6 +140,29 @@ def write_cloud(path: str | Path, points: ArrayLike) -> None:
     write_whole(path, lambda file: file.write(content))
 
 
+def _read(
+    path: Path,
+    readers: Mapping[str, Callable[[Path], Table]],
+    make: Callable[[NDArray[Any], NDArray[Any] | None, tuple[str, ...]], Cloud],
+) -> Cloud:
+    """What `make` makes of points, intensity and repairs of a file."""
+    reader = _reader_for(path, readers)
+    table = Table({})
+    try:
+        with np.errstate(all="ignore"):  # what overflows becomes infinite, and is dropped as such
+            table = reader(path)
+            check_points(max(map(len, table.columns.values()), default=0), path.stat().st_size)
+            points, intensity = _cloud_of(table.columns)
+            for repair in table.repairs:
+                logger.warning("%s: %s", path.stem, repair)
+            return make(points, intensity, table.repairs)
+    except TerrainLoopError as error:
+        found = "; ".join([f"{path}: {error.found}", *table.repairs])
+        raise TerrainLoopError(expected=error.expected, found=found, mend=error.mend) from error
+    except Exception as error:  # what readers raise on damaged files is not documented
+        raise _damaged(path, error) from error
+
+
 def _damaged(path: Path, error: Exception) -> TerrainLoopError:
     if isinstance(error, OSError) and error.filename is not None:
         return TerrainLoopError(
@@ -142,14 +178,14 @@ def _damaged(path: Path, error: Exception) -> TerrainLoopError:
     )
 
 
-def _reader_for(path: Path) -> Callable[[Path], Table]:
-    reader = _READERS.get(path.suffix.lower())
+def _reader_for(path: Path, readers: Mapping[str, Callable[[Path], Table]]) -> Callable[[Path], Table]:
+    reader = readers.get(path.suffix.lower())
     regular = os.path.isfile(path)  # noqa: PTH113  Path.is_file raises for names that are too long
     if reader is not None and regular and path.stat().st_size > 0:
         return reader
     found = "no file" if not regular else "an empty file" if reader else "another suffix"
     raise TerrainLoopError(
-        expected=f"a cloud with one of the suffixes {' '.join(CLOUD_SUFFIXES)}",
+        expected=f"a cloud with one of the suffixes {' '.join(readers)}",
         found=f"{found} at {path}",
         mend="give the path of a cloud, or export it in one of these formats",
     )
@@ -200,6 +236,7 @@ _READERS: dict[str, Callable[[Path], Table]] = {
     ".txt": read_text,
     ".csv": read_text,
 }
+_SCAN_READERS = _READERS | {".bin": read_kitti}
 _WRITERS: dict[str, Callable[[NDArray[np.float64]], bytes]] = {
     ".ply": _ply,
     ".npy": lambda points: _saved(lambda file: np.save(file, points)),
@@ -209,3 +246,6 @@ _WRITERS: dict[str, Callable[[NDArray[np.float64]], bytes]] = {
 
 CLOUD_SUFFIXES = tuple(_READERS)
 """Suffixes, in lower case, of the files that `read_cloud` reads."""
+
+SCAN_SUFFIXES = tuple(_SCAN_READERS)
+"""Suffixes, in lower case, of the files that `read_scan` reads."""
