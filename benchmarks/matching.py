@@ -51,6 +51,7 @@ from terrainloop.evaluation.summary import OVERLAP_BANDS
 from terrainloop.evaluation.truth import GroundTruth
 from terrainloop.geometry import inverse, parameters_of, se3, transform, yaw_of
 from terrainloop.io.clouds import write_cloud
+from terrainloop.io.files import write_whole
 from terrainloop.io.missions import load_mission, read_sessions
 from terrainloop.io.trajectories import read_trajectory
 from terrainloop.matching import decision, hypotheses, register
@@ -82,7 +83,9 @@ def mapped(folder):
     if not cache.exists():
         content = [cloud.entry for cloud in MissionMapping.of(mission, EVIDENCE, 2).clouds(1)]
         CACHE.mkdir(parents=True, exist_ok=True)
-        cache.write_bytes(pickle.dumps(content))
+        write_whole(
+            cache, lambda file: file.write(pickle.dumps(content))
+        )  # two processes may map one mission
     entries = pickle.loads(cache.read_bytes())
     sessions = None
     if (folder / "passes.csv").exists():

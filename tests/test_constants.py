@@ -17,7 +17,17 @@ PAGE = ROOT / "docs" / "calibration.md"
 PACKAGE = Path(terrainloop.__file__).parent
 DETECTION = tuple(f"detection/{name}" for name in ("mission", "detector", "flat_field", "sensor_pattern"))
 # Where any number changes results. Limits on input, formats and drawings are not of that kind.
-PYTHON = ("features", "field", "gradient_map", "loop", "matching", "gp", *DETECTION, "evaluation")
+PYTHON = (
+    "features",
+    "field",
+    "gradient_map",
+    "loop",
+    "matching",
+    "gp",
+    *DETECTION,
+    "pose_graph",
+    "evaluation",
+)
 CORE = ("cpp/src", "cpp/include")
 
 

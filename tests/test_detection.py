@@ -1,8 +1,10 @@
 """The detector: loops of a revisit, its database, and whole missions with a broken cloud."""
 
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 from conftest import BROKEN, PLACES
@@ -11,11 +13,13 @@ from terrainloop.config import MatchSettings, Settings
 from terrainloop.detection import detector as detecting
 from terrainloop.detection.detector import LoopDetector, fit_database, map_submap
 from terrainloop.detection.mission import detect_mission
+from terrainloop.detection.run import CORRECTED, OF_A_RUN
 from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import parameters_of, se3, transform
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.io.missions import load_mission
 from terrainloop.io.results import write_loops
+from terrainloop.io.trajectories import read_trajectory
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.mission_warp import warp_variance
 from terrainloop.submap import Submap
@@ -274,10 +278,28 @@ def test_mission_reports_its_progress(detected):
     assert stages == done + [("pairs", n, 4) for n in range(1, 5)]
 
 
+def test_poses_of_a_mission_with_odometry_are_corrected_and_written(detected):
+    run, _ = detected
+    written = read_trajectory(run.folder / "poses.tum")
+    np.testing.assert_allclose(written.poses, run.corrected.poses, atol=1e-9)
+    assert len(written) == len(run.corrected.graph.names)
+    _, values = gtsam.readG2o(str(run.folder / "graph.g2o"), True)
+    assert values.size() == len(written)
+
+
+def test_poses_that_cannot_be_corrected_are_a_warning(detected, monkeypatch):
+    run = replace(detected[0], corrected=None)
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    loop = replace(next(iter(run.pairs())), accepted=True, covariance=np.eye(6))
+    without = replace(run, loops=(loop,)).with_corrected_poses()
+    assert without.corrected is None
+    assert without.warnings[-1].startswith("no corrected poses: expected GTSAM")
+
+
 def test_mission_is_the_same_for_two_processes(detected, mission_folder, strict, tmp_path):
     one, two = detected[0], detect_mission(mission_folder, strict, output=tmp_path, workers=2)
     names = {path.name for path in one.folder.iterdir()}
-    assert names == {"loops.csv", "pairs.csv", "submaps.csv", "config.yaml", "run.json"}
+    assert names == {*OF_A_RUN, *CORRECTED}  # the mission has odometry
     for name in names:
         assert (one.folder / name).read_bytes() == (two.folder / name).read_bytes()
     assert one.num_pairs == two.num_pairs == 3

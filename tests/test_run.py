@@ -17,7 +17,7 @@ from terrainloop.config import Settings
 from terrainloop.detection import run as module
 from terrainloop.detection.detector import LoopDetector
 from terrainloop.detection.mission import detect_mission
-from terrainloop.detection.run import DERIVED, OF_A_RUN, Run, RunWriter
+from terrainloop.detection.run import CORRECTED, DERIVED, OF_A_RUN, Run, RunWriter
 from terrainloop.errors import TerrainLoopError
 from terrainloop.gp.kernel import Hyperparameters
 from terrainloop.io.missions import Mission
@@ -64,7 +64,7 @@ def test_a_run_is_read_as_it_was_written(tmp_path):
 
 def test_a_later_run_replaces_all_that_the_earlier_one_left(tmp_path):
     write(tmp_path, 3)
-    for name in DERIVED:
+    for name in (*CORRECTED, *DERIVED):
         (tmp_path / name).write_bytes(b"stale")
     (tmp_path / "notes.txt").write_bytes(b"mine")
     write(tmp_path, 1)

@@ -83,6 +83,7 @@ def summarise(run: "Run") -> dict[str, Any]:
         "warnings": list(run.warnings),
         "rejections": dict(run.rejections),
         "loops": [loop_to_dict(loop) for loop in run.loops],
+        "corrected": run.corrected is not None,
         "output": str(run.folder),
     }
 
@@ -124,9 +125,10 @@ def show(console: Console, run: "Run") -> None:
         console.print(f"Warning: {words}.")
     if repaired:
         console.print(f"  {count_of(repaired, 'submap')} with repairs or warnings: see notes in submaps.csv")
+    poses = ", poses.tum and graph.g2o (odometry corrected by the loops)" if run.corrected else ""
     console.print(
         f"Written to {printable(str(run.folder))}: loops.csv, pairs.csv (why each was rejected), "
-        "submaps.csv, config.yaml, run.json"
+        f"submaps.csv, config.yaml, run.json{poses}"
     )
 
 

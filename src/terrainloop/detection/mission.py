@@ -196,7 +196,7 @@ def _compare(run: Run, on_pair: PairSink, workers: int, on_progress: Progress) -
         run = replace(run, complete=False)
     run = tally.of(run)
     loops = tuple(with_mission_warp(run.loops, run.settings.calibration))
-    return replace(run, loops=loops, warnings=detector.warnings)
+    return replace(run, loops=loops, warnings=detector.warnings).with_corrected_poses()
 
 
 @contextmanager

@@ -25,12 +25,17 @@ from terrainloop.io.results import (
     write_submaps,
 )
 from terrainloop.io.staging import errors_naming, publish, staging
+from terrainloop.io.trajectories import write_tum
 from terrainloop.loop import LoopCandidate
+from terrainloop.pose_graph import PoseGraph, Solution
 from terrainloop.record import SubmapRecord
 
 LOOPS, PAIRS, SUBMAPS, CONFIG, RUN = "loops.csv", "pairs.csv", "submaps.csv", "config.yaml", "run.json"
+POSES, GRAPH = "poses.tum", "graph.g2o"
 OF_A_RUN = (RUN, LOOPS, PAIRS, SUBMAPS, CONFIG)
 """Files of every run."""
+CORRECTED = (POSES, GRAPH)
+"""Files of a run whose submaps have odometry."""
 DERIVED = (
     *("precision_recall.csv", "precision_recall_curve.csv", "precision_recall.png"),  # evaluate
     *("mission.png", "map.png", "match.png"),  # demo
@@ -59,6 +64,8 @@ class Run:
         What casts doubt on the run, in words.
     entries : mapping of str to MapEntry
         The mapped submaps by id; empty where the run was read from a folder.
+    corrected : Solution or None
+        The poses by the pose graph; None without odometry, and where the run was read from a folder.
     folder : Path or None
         Folder that it was written to or read from.
     """
@@ -71,6 +78,7 @@ class Run:
     complete: bool = True
     warnings: tuple[str, ...] = ()
     entries: Mapping[str, MapEntry] = field(default_factory=dict)
+    corrected: Solution | None = None
     folder: Path | None = None
 
     def __repr__(self) -> str:
@@ -96,6 +104,17 @@ class Run:
                 mend="give detect_mission an output",
             )
         return iterate_loops(self.folder / PAIRS)
+
+    def with_corrected_poses(self) -> "Run":
+        """The run with poses that odometry and loops agree on, or a warning why there are none."""
+        graph = PoseGraph.of(self.submaps, self.loops)
+        if not graph.names:
+            return self
+        try:
+            solution = graph.solve()
+        except TerrainLoopError as error:
+            return replace(self, warnings=(*self.warnings, f"no corrected poses: {error}"))
+        return replace(self, corrected=solution, warnings=(*self.warnings, *solution.warnings))
 
     @classmethod
     def read(cls, folder: Path | str) -> "Run":
@@ -170,7 +189,7 @@ class RunWriter:
     @contextmanager
     def open(cls, folder: Path) -> Iterator["RunWriter"]:
         """A writer into `folder`; its files are removed at the end, unless `finish` was called."""
-        for name in (*OF_A_RUN, *DERIVED):
+        for name in (*OF_A_RUN, *CORRECTED, *DERIVED):
             if (folder / name).is_dir():
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(folder / name))
         with staging(folder) as aside:
@@ -196,10 +215,14 @@ class RunWriter:
             run = replace(run, folder=self._folder)
             write_loops(self._aside / LOOPS, run.loops)
             write_submaps(self._aside / SUBMAPS, run.submaps)
+            if run.corrected is not None:
+                write_tum(self._aside / POSES, run.corrected.trajectory)
+                run.corrected.write_g2o(self._aside / GRAPH)
             about, settings = _About.of(run).to_json(), run.settings.to_yaml()
             write_whole_text(self._aside / RUN, lambda file: file.write(about))
             write_whole_text(self._aside / CONFIG, lambda file: file.write(settings))
-        publish(self._aside, self._folder, reversed(OF_A_RUN), stale=(*OF_A_RUN, *DERIVED))
+        names = (*reversed(OF_A_RUN), *(CORRECTED if run.corrected is not None else ()))
+        publish(self._aside, self._folder, names, stale=(*OF_A_RUN, *CORRECTED, *DERIVED))
         return run
 
 
