@@ -22,7 +22,7 @@ from terrainloop.geometry import parameters_of, transform
 from terrainloop.gradient_map import GradientMap
 from terrainloop.simulation.names import SENSORS, WORLDS
 
-COMMANDS = ("demo", "map", "match", "detect", "evaluate", "simulate", "config")
+COMMANDS = ("demo", "map", "match", "detect", "info", "evaluate", "simulate", "config")
 CONTRACT = [  # DESIGN.md, section 3
     *("source", "target", "tx_m", "ty_m", "tz_m", "roll_rad", "pitch_rad", "yaw_rad"),
     *("inliers", "ssd", "overlap", "score", "accepted", "reason"),
