@@ -31,6 +31,7 @@ _TEXTS = (".txt", ".csv")  # in the folder itself these hold trajectories and no
 _TIMES, _CALIBRATION = "times.txt", "calib.txt"
 _LARGEST_TEXT = 64 << 20  # bytes
 _MISSION_KIND = "mission of submaps"
+_NO_ODOMETRY = "no odometry.tum, which 'terrainloop slam' needs, one pose for each submap"
 _OUTSIDE = "outside the time span of the poses, or in a gap of them"
 
 
@@ -62,23 +63,23 @@ def open_folder_recording(folder: Path, sensor_frame: str) -> Recording:
 
 
 def _mission_of(folder: Path) -> Recording | None:
-    """The folder as a mission of submaps; None where it is not one with odometry."""
-    if not any((folder / f"odometry{suffix}").is_file() for suffix in (".tum", ".txt")):
-        return None
+    """The folder as a mission of submaps; None where it is not one by its trajectories."""
     try:
         mission = load_mission(folder)
     except TerrainLoopError as error:
         logger.info("%s is not a mission of submaps: %s", folder, error)
         return None
-    if mission.odometry is None:
+    known = {"odometry": mission.odometry, "truth": mission.truth}
+    trajectories = {name: trajectory for name, trajectory in known.items() if trajectory is not None}
+    if not trajectories:
         return None
-    posed = _Posed(mission.files, mission.odometry.stamps, tuple(mission.odometry.poses))
-    streams = [_clouds_stream(posed, "submaps"), _poses_stream("odometry", mission.odometry)]
-    if mission.truth is not None:
-        streams.append(_poses_stream("truth", mission.truth, use="evaluation"))
-    remarks = ("every cloud is a submap with a pose of its own: 'terrainloop detect' takes it as it is",)
-    description = Description(_MISSION_KIND, str(folder), tuple(streams), remarks)
-    return Recording(description, "unknown", len(posed.files), partial(_posed_scans, posed, np.eye(4)))
+    poses = mission.odometry.poses if mission.odometry is not None else [None] * len(mission)
+    posed = _Posed(mission.files, next(iter(trajectories.values())).stamps, tuple(poses))
+    streams = (_clouds_stream(posed, "submaps"), *(_poses_stream(*item) for item in trajectories.items()))
+    remarks = ("every cloud is a submap: 'terrainloop detect' takes it as it is",)
+    missing = () if mission.odometry is not None else (_NO_ODOMETRY,)
+    description = Description(_MISSION_KIND, str(folder), streams, remarks, missing)
+    return Recording(description, "unknown", len(mission), partial(_posed_scans, posed, np.eye(4)))
 
 
 def _scans_of(folder: Path, sensor_frame: str) -> Recording:
@@ -257,8 +258,9 @@ def _clouds_stream(posed: _Posed, use: str) -> Stream:
     return Stream(folder, _suffixes(posed.files), len(posed.files), start=start, end=end, use=use)
 
 
-def _poses_stream(name: str, trajectory: Trajectory, use: str = "odometry") -> Stream:
+def _poses_stream(name: str, trajectory: Trajectory) -> Stream:
     start, end = float(trajectory.stamps.min()), float(trajectory.stamps.max())
+    use = "evaluation" if name == "truth" else "odometry"
     return Stream(name, "poses", len(trajectory), start=start, end=end, use=use)
 
 

@@ -101,14 +101,15 @@ def _missing(
 
 def _clock_trouble(scans: Stream, placement: Placement) -> list[str]:
     """Why no scan would have a pose, by the stamps alone."""
-    if scans.start is None or scans.end is None or scans.end <= 0:
+    stamps = [stamp for stamp in (scans.start, scans.end) if stamp is not None and stamp > 0]
+    if not stamps:
         return [f"the headers of {scans.name} have no stamps: set header.stamp when they are recorded"]
     if placement.span is None:
         return []
     first, last = placement.span
-    if scans.end < first or last < scans.start:
+    if max(stamps) < first or last < min(stamps):
         return [
-            f"the stamps of {scans.name} ({scans.start:.3f} to {scans.end:.3f} s) and of the odometry "
+            f"the stamps of {scans.name} ({min(stamps):.3f} to {max(stamps):.3f} s) and of the odometry "
             f"({first:.3f} to {last:.3f} s) do not meet: stamp both by one clock (use_sim_time, or PTP)"
         ]
     return []
