@@ -1,6 +1,7 @@
 """Posed scans of ROS bags of all kinds, whatever is in them."""
 
 import shutil
+import tarfile
 from pathlib import Path
 
 import numpy as np
@@ -230,6 +231,17 @@ def test_poses_that_name_no_body(tf, tmp_path):
     recording, (posed,) = recorded(write_bag(tmp_path, "ros1", stamped))
     np.testing.assert_allclose(posed.T_world_sensor, se3(0.5, 0, float(tf), 0, 0, 0), atol=1e-6)
     assert any("names no frame" in words for words in recording.description.remarks)
+
+
+def test_poses_of_a_body_that_carries_a_camera(tmp_path):
+    def stamped(make):
+        for i in range(3):
+            yield "/pose", START + i, make.pose_stamped(START + i, (i, 0, 0))
+        yield "/points", START + 0.5, make.cloud(START + 0.5, POINTS, "camera_optical_frame")
+
+    recording, (posed,) = recorded(write_bag(tmp_path, "ros1", stamped))
+    np.testing.assert_allclose(posed.T_world_sensor, se3(0.5, 0, 0, 0, 0, 0) @ T_BODY_OPTICAL, atol=1e-6)
+    assert any("a body with z up" in words for words in recording.description.remarks)
 
 
 def test_poses_with_covariance(tmp_path):
@@ -676,3 +688,33 @@ def test_bags_of_others(name, monkeypatch):
     assert all(stream.count for stream in recording.description.streams)
     with pytest.raises(TerrainLoopError, match="terrainloop info"):
         next(recording.scans())
+
+
+ARCHIVE = REAL / "ros-perception+point_cloud_transport_tutorial" / "rosbag2_d435_pointcloud2_mcap.tar.xz"
+
+
+@pytest.mark.skipif(not ARCHIVE.is_file(), reason="without the bags of others")
+def test_a_bag_of_a_camera_of_others(tmp_path):
+    """Its clouds, in the frame of a camera, with the odometry that it lacks."""
+    with pytest.raises(TerrainLoopError, match="unpack the archive first"):
+        open_recording(ARCHIVE)
+    with tarfile.open(ARCHIVE) as archive:
+        archive.extractall(tmp_path, filter="data")
+    (bag,) = tmp_path.iterdir()
+    recording = open_recording(bag)
+    assert (recording.sensor, recording.count) == ("stereo", 263)
+    assert recording.description.missing[0].startswith("no odometry")
+    stream = recording.description.streams[0]
+    poses = tmp_path / "poses"
+    poses.mkdir()
+
+    def standing(make):
+        for now in (stream.start, stream.end):
+            yield "/odom", now, make.odometry(now, (0, 0, 1))
+
+    scans = open_recording([bag, write_bag(poses, "mcap", standing)]).scans()
+    posed = next(scans)
+    depth = posed.scan.points[:, 2]
+    assert len(depth) > 10_000
+    assert 0 < depth.min() < np.median(depth) < 20
+    np.testing.assert_allclose(posed.T_world_sensor, se3(0, 0, 1, 0, 0, 0) @ T_BODY_OPTICAL, atol=1e-9)

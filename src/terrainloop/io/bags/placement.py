@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,21 +137,34 @@ def placement_of(bag: Bag, scans: Scans, poses: Topic | None, sensor_frame: str)
         )
     if poses is None:
         return _from_tf(frames, named, sensor_frame)
-    world, child = child_frame_of(bag, poses)
-    remarks = []
-    if not child and sensor_frame not in ("optical", "body"):
-        child = frames.body_of(named)
-        where = "the top of TF below the odometry" if named in frames.names() else "as no TF says otherwise"
-        remarks.append(
-            f"{poses.name} names no frame that it is the pose of: taken as that of {child!r} ({where})"
-        )
-    track = _read_track(bag, poses, world, child, remarks)
-    missing = [] if track is not None else [f"{poses.name} holds no pose that can be used: record it again"]
+    world, body = child_frame_of(bag, poses)
+    remarks: list[str] = []
+    track = _read_track(bag, poses, world, body, remarks)
     optical = is_optical(named) or scans.topic.type == IMAGE
-    placement = Placement(world, child, track, frames, sensor_frame, optical, remarks, missing)
-    if track is not None:
-        _check(placement, scans.frame, poses, track)
+    placement = Placement(world, body, track, frames, sensor_frame, optical, remarks)
+    if track is None:
+        placement.missing.append(f"{poses.name} holds no pose that can be used: record it again")
+        return placement
+    if not body and sensor_frame not in ("optical", "body"):
+        body = _unnamed_body(frames, named, track)
+        remarks.append(
+            f"{poses.name} names no frame that it is the pose of: taken as that of "
+            f"{body or 'a body with z up'!r}"
+        )
+        placement = replace(placement, body=body)
+    _check(placement, scans.frame, poses, track)
     return placement
+
+
+def _unnamed_body(frames: Frames, sensor: str, track: PoseTrack) -> str:
+    """The frame of poses that name none: the body that TF has the sensor on, else the sensor itself.
+
+    Empty if the sensor is a camera by its name, and the poses those of a body with z up by their tilt.
+    """
+    body = frames.body_of(sensor)
+    upright = not why_not_upright(track.rotations, "")
+    tilted_camera = is_optical(body) and bool(why_not_upright(track.rotations, body))
+    return "" if upright and tilted_camera else body
 
 
 def _check(placement: Placement, frame: str, poses: Topic, track: PoseTrack) -> None:

@@ -53,12 +53,17 @@ class Topic:
     count: int
 
 
-class _Source(Protocol):
-    """What rosbags' readers and a salvaged file have in common."""
+class _Reader(Protocol):
+    """What rosbags' two readers have in common."""
 
     @property
     def connections(self) -> Sequence[Any]: ...
+    @property
+    def end_time(self) -> int: ...
     def messages(self, connections: Any, start: int | None = None) -> Iterator[tuple[Any, int, bytes]]: ...
+
+
+_Source = _Reader | SalvagedMcap
 
 
 class Bag:
@@ -154,8 +159,11 @@ class Bag:
 
     def last(self, topic: Topic) -> bytes | None:
         """The last message of a topic by bag time."""
+        for source, connection in self._connections[topic]:
+            if isinstance(source, SalvagedMcap):  # which has no index to look it up
+                return source.last[connection.id]
         with _errors_of(self.path):
-            end = max(getattr(source, "end_time", 0) for source in self._sources)
+            end = max(source.end_time for source in self._sources if not isinstance(source, SalvagedMcap))
         window = _WINDOW
         while True:
             start = end - window if window < end else None
@@ -179,7 +187,7 @@ class Bag:
         try:
             with _errors_of(str(file)):
                 reader: Any = Reader1(file) if self._ros1 else Reader2(file)
-                return cast(_Source, self._stack.enter_context(reader))
+                return cast(_Reader, self._stack.enter_context(reader))
         except TerrainLoopError as error:
             if file.suffix.lower() != ".mcap" or not can_salvage():
                 raise

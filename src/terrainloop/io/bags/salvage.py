@@ -34,23 +34,23 @@ class SalvagedMcap:
     ----------
     connections : list
         One for each channel with messages in CDR, the encoding of ROS 2.
-    end_time : int
-        Latest bag time, nanoseconds.
+    last : dict
+        The last message of each channel, by its number.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self.connections: list[_Connection] = []
-        self.end_time = 0
+        self.last: dict[int, bytes] = {}
 
     def open(self) -> None:
         """Find out what there is, by reading all of it once."""
         channels: dict[int, _Connection] = {}
         counts: Counter[int] = Counter()
-        for connection, time, _ in self._records():
+        for connection, _, raw in self._records():
             channels[connection.id] = connection
             counts[connection.id] += 1
-            self.end_time = max(self.end_time, time)
+            self.last[connection.id] = raw
         self.connections = [_Connection(c.id, c.topic, c.msgtype, counts[c.id]) for c in channels.values()]
 
     def messages(
