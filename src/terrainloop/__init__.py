@@ -16,10 +16,12 @@ if TYPE_CHECKING:
     from terrainloop.gp.kernel import Hyperparameters
     from terrainloop.gp.process import ElevationProcess
     from terrainloop.gradient_map import GradientMap
-    from terrainloop.io.clouds import read_cloud, read_crs, write_cloud
+    from terrainloop.io.clouds import read_cloud, read_crs, read_scan, write_cloud
     from terrainloop.io.missions import Mission, load_mission
+    from terrainloop.io.recordings import Recording, open_recording
     from terrainloop.loop import LoopCandidate
     from terrainloop.matching.register import register
+    from terrainloop.scan import PosedScan, Scan
     from terrainloop.submap import Submap
 
 _HOME = {
@@ -30,15 +32,20 @@ _HOME = {
     "LoopDetector": "detection.detector",
     "MapEntry": "entry",
     "Mission": "io.missions",
+    "PosedScan": "scan",
+    "Recording": "io.recordings",
     "Run": "detection.run",
+    "Scan": "scan",
     "Settings": "config",
     "Submap": "submap",
     "TerrainLoopError": "errors",
     "detect_mission": "detection.mission",
     "fit_hyperparameters": "gp.hyperparameters",
     "load_mission": "io.missions",
+    "open_recording": "io.recordings",
     "read_cloud": "io.clouds",
     "read_crs": "io.clouds",
+    "read_scan": "io.clouds",
     "register": "matching.register",
     "write_cloud": "io.clouds",
 }
@@ -51,15 +58,20 @@ __all__ = [
     "LoopDetector",
     "MapEntry",
     "Mission",
+    "PosedScan",
+    "Recording",
     "Run",
+    "Scan",
     "Settings",
     "Submap",
     "TerrainLoopError",
     "detect_mission",
     "fit_hyperparameters",
     "load_mission",
+    "open_recording",
     "read_cloud",
     "read_crs",
+    "read_scan",
     "register",
     "write_cloud",
 ]

@@ -28,7 +28,7 @@ _LIDAR_NAMES = ("lidar", "laser", "velodyne", "ouster", "hesai", "pandar", "livo
 _CAMERA_NAMES = ("optical", "camera", "stereo", "depth", "realsense", "zed")
 
 
-def points_of(message: Any) -> tuple[NDArray[Any], NDArray[Any] | None]:
+def points_of(message: Any) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     """Points (N, 3) and, where there is one, the intensity (N,), without the returns that are none.
 
     Points at the very origin of the sensor are how drivers mark beams without a return.
@@ -51,10 +51,11 @@ def points_of(message: Any) -> tuple[NDArray[Any], NDArray[Any] | None]:
     data = np.pad(data, (0, max(0, height * row - len(data))))  # the last row may end with its last point
     rows = data[: height * row].reshape(height, row)[:, : width * step]
     table = np.ascontiguousarray(rows).reshape(-1).view(columns)
-    points = np.column_stack([table[axis] for axis in "xyz"])
-    returned = np.isfinite(points).all(axis=1) & points.any(axis=1)
-    intensity = table["intensity"][returned] if "intensity" in (columns.names or ()) else None
-    return points[returned], intensity
+    with np.errstate(invalid="ignore"):  # signalling NaNs
+        numbers = {name: table[name].astype(np.float64) for name in columns.names or ()}
+    points = np.column_stack([numbers[axis] for axis in "xyz"])
+    returned = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
+    return points[returned], numbers["intensity"][returned] if "intensity" in numbers else None
 
 
 def sensor_of(message: Any, topic: str) -> Sensor:

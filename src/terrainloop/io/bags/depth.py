@@ -86,7 +86,8 @@ def depth_points(message: Any, camera: Camera) -> NDArray[np.float64]:
     if not sizes or row < width * kind.itemsize or height * row > len(data):
         raise ValueError(f"{height} rows of {width} pixels, {row} bytes each, in {len(data)} bytes")
     rows = data[: height * row].reshape(height, row)[:, : width * kind.itemsize]
-    depth = np.ascontiguousarray(rows).view(kind).reshape(height, width).astype(np.float64) * unit
+    with np.errstate(invalid="ignore"):  # signalling NaNs
+        depth = np.ascontiguousarray(rows).view(kind).reshape(height, width).astype(np.float64) * unit
     camera = camera.scaled_to(width, height)
     v, u = np.nonzero(np.isfinite(depth) & (depth > 0))
     z = depth[v, u]
