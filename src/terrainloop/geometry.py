@@ -53,6 +53,12 @@ def se3(x: float, y: float, z: float, roll: float, pitch: float, yaw: float) -> 
     )
 
 
+def levelled(T: Array) -> Array:
+    """The upright pose (4, 4) with the same position and yaw."""
+    x, y, z = T[:3, 3]
+    return se3(x, y, z, 0.0, 0.0, yaw_of(T))
+
+
 def parameters_of(T: Array) -> Array:
     """The six numbers (x, y, z, roll, pitch, yaw) of an SE(3) transform; inverse of `se3`."""
     horizontal = np.hypot(T[0, 0], T[1, 0])

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from terrainloop import __version__
-from terrainloop.cli import config, demo, detect, evaluate, info, map, match, simulate
+from terrainloop.cli import config, demo, detect, evaluate, info, map, match, simulate, slam
 
 app = typer.Typer(
     name="terrainloop",
@@ -36,6 +36,6 @@ def _options(
     """Loop closures from the shape of the ground."""
 
 
-for _module in (demo, map, match, detect, info, evaluate, simulate, config):
+for _module in (demo, map, match, detect, slam, info, evaluate, simulate, config):
     # Not from docstrings, which Python leaves out when it optimises.
     app.command(_module.__name__.rpartition(".")[2], help=_module.HELP)(_module.command)

@@ -3,7 +3,7 @@
 import errno
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -206,8 +206,16 @@ class RunWriter:
         with errors_naming(self._folder):
             self._pairs.write(candidate)
 
-    def finish(self, run: Run) -> Run:
-        """Write the rest of the run and move all of it into the folder."""
+    def finish(self, run: Run, products: Mapping[str, Callable[[Path], object]] | None = None) -> Run:
+        """Write the rest of the run and move all of it into the folder.
+
+        Parameters
+        ----------
+        run : Run
+        products : mapping of str to callable, optional
+            Further files of the folder, by name: each is called with the path to write to.
+        """
+        products = products or {}
         with errors_naming(self._folder):
             self._pairs.close()
             if not run.complete:  # it may have been interrupted between writing a pair and counting it
@@ -218,10 +226,12 @@ class RunWriter:
             if run.corrected is not None:
                 write_tum(self._aside / POSES, run.corrected.trajectory)
                 run.corrected.write_g2o(self._aside / GRAPH)
+            for name, write in products.items():
+                write(self._aside / name)
             about, settings = _About.of(run).to_json(), run.settings.to_yaml()
             write_whole_text(self._aside / RUN, lambda file: file.write(about))
             write_whole_text(self._aside / CONFIG, lambda file: file.write(settings))
-        names = (*reversed(OF_A_RUN), *(CORRECTED if run.corrected is not None else ()))
+        names = (*reversed(OF_A_RUN), *(CORRECTED if run.corrected is not None else ()), *products)
         publish(self._aside, self._folder, names, stale=(*OF_A_RUN, *CORRECTED, *DERIVED))
         return run
 

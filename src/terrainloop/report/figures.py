@@ -11,14 +11,17 @@ from terrainloop.config import Settings
 from terrainloop.entry import MapEntry
 from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.summary import Evaluation
+from terrainloop.evaluation.trajectory_error import trajectory_error
 from terrainloop.geometry import Array, se2, transform, yaw_of
 from terrainloop.gradient_map import GradientMap
 from terrainloop.io.files import write_whole
+from terrainloop.io.trajectories import Trajectory
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.correspondences import Associations, associate
 from terrainloop.matching.overlay import Overlay
 from terrainloop.matching.ransac import get_inliers, inlier_radius_of
 from terrainloop.report import INSTALL_FIGURES
+from terrainloop.slam.mosaic import Mosaic
 from terrainloop.submap import Submap
 
 try:
@@ -160,6 +163,58 @@ def figure_mission(
         )
     axes.legend(loc="best")
     _finish(axes, title)
+    return figure
+
+
+def figure_trajectory(
+    before: Trajectory, after: Trajectory, loop_ends: Array, truth: Trajectory | None = None
+) -> Figure:
+    """A trajectory as recorded and as corrected by its loops, and the true one where it is known.
+
+    Parameters
+    ----------
+    before, after : Trajectory
+        In one world.
+    loop_ends : array, (L, 2, 2)
+        Positions (x, y) of the two submaps of each loop.
+    truth : Trajectory, optional
+        Moved and turned about the vertical to fit the corrected trajectory.
+    """
+    figure = Figure(figsize=(9, 8), layout="constrained")
+    axes = figure.add_subplot()
+    if truth is not None:
+        aligned = np.linalg.inv(trajectory_error(after, truth).T_truth_estimate) @ truth.poses
+        axes.plot(*aligned[:, :2, 3].T, color="0.75", linewidth=4, label="truth")
+    axes.plot(*before.poses[:, :2, 3].T, "--", color=SOURCE_COLOUR, linewidth=1.2, label="odometry")
+    axes.plot(*after.poses[:, :2, 3].T, color=TARGET_COLOUR, linewidth=1.6, label="corrected")
+    for number, ends in enumerate(loop_ends):
+        label = None if number else f"{len(loop_ends)} loop closures"
+        axes.plot(*ends.T, color="#edae49", linewidth=0.8, alpha=0.7, label=label, zorder=1)
+    axes.plot(*after.poses[0, :2, 3], "o", color="0.1", markersize=6, label="start")
+    axes.legend(loc="best")
+    way = np.linalg.norm(np.diff(after.poses[:, :3, 3], axis=0), axis=1).sum()
+    _finish(axes, f"Trajectory of {way:.0f} m, before and after")
+    return figure
+
+
+def figure_mosaic(mosaic: Mosaic) -> Figure:
+    """Shaded relief of the ground that was mapped, lit from the north-west, and its elevation."""
+    figure = Figure(figsize=(10, 8), layout="constrained")
+    axes = figure.add_subplot()
+    rows, columns = mosaic.elevation.shape
+    (x, y), r = mosaic.origin, mosaic.resolution
+    extent = (x - r / 2, x + (columns - 0.5) * r, y - r / 2, y + (rows - 0.5) * r)
+    light = np.array([-1.0, 1.0, 1.5])
+    normal = np.stack([-mosaic.gradient_x, -mosaic.gradient_y, np.ones_like(mosaic.gradient_x)])
+    shade = np.tensordot(light / np.linalg.norm(light), normal, 1) / np.linalg.norm(normal, axis=0)
+    axes.set_facecolor("#e8edf2")  # of no value of either scale
+    axes.imshow(shade, origin="lower", extent=extent, cmap="gray", vmin=0.2, vmax=1.0)
+    low, high = np.nanpercentile(mosaic.elevation, [1, 99])
+    image = axes.imshow(
+        mosaic.elevation, origin="lower", extent=extent, cmap="cividis", alpha=0.35, vmin=low, vmax=high
+    )
+    figure.colorbar(image, ax=axes, shrink=0.7, label="elevation, m")
+    _finish(axes, f"Shaded relief, {r:.3g} m per pixel")
     return figure
 
 
