@@ -1,22 +1,39 @@
-"""``terrainloop evaluate``: a run against ground truth."""
+"""``terrainloop evaluate``: a run, or a trajectory, against ground truth."""
 
 import math
+from collections.abc import Mapping
+from dataclasses import astuple
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
 
 from terrainloop.cli.terminal import Json, Quiet, Terminal, Verbose, count_of, table_of
+from terrainloop.errors import TerrainLoopError
 
 if TYPE_CHECKING:
     from terrainloop.evaluation.summary import Evaluation
+    from terrainloop.evaluation.trajectory_error import Span, TrajectoryError
 
 OVERLAPS = {"box": "bounding-box IoU", "observed": "IoU of the observed ground"}
 CRITERIA = ("pose", "overlap and pose", "overlap")
 
 
+ALIGNED = {
+    "yaw": "Aligned to the truth by a rotation about z and a translation.",
+    "se3": "Aligned to the truth by a rotation and a translation.",
+    "first": "Aligned to the truth by the first pose.",
+    "none": "Not aligned to the truth.",
+}
+LOOPS, TRAJECTORIES = "Loops of a run", "Trajectories"
+
+
 HELP = """Evaluate a run against ground-truth poses: loops, revisits, precision and recall.
+
+The absolute trajectory error (ATE) and the relative pose error (RPE) are reported for poses.tum and
+trajectory.tum of the run, and for odometry.tum there or beside the truth; for a trajectory in place
+of a run, nothing else is.
 
 Writes precision_recall.csv, precision_recall_curve.csv and precision_recall.png into the folder of
 the run. Pairs of consecutive submaps are left out because odometry already connects them. Run
@@ -24,14 +41,24 @@ detect with --all-pairs to score every other pair."""
 
 
 def command(
-    run: Annotated[Path, typer.Argument(help="Output folder of 'terrainloop detect'.")],
-    truth: Annotated[Path, typer.Option("--truth", help="True poses, TUM or KITTI, one line per cloud.")],
+    run: Annotated[
+        Path, typer.Argument(help="Output folder of 'terrainloop detect', or a trajectory, TUM or KITTI.")
+    ],
+    truth: Annotated[
+        Path,
+        typer.Option(
+            "--truth",
+            help="True poses, TUM or KITTI: one line per cloud for a run, with the stamps of one clock for a "
+            "trajectory.",
+        ),
+    ],
     min_overlap: Annotated[
         float,
         typer.Option(
             "--min-overlap",
             min=0.0,
             max=1.0,
+            rich_help_panel=LOOPS,
             help="A pair is true if its bounding-box IoU exceeds this (the paper: 0.3, Morocco 0.1).",
         ),
     ] = 0.3,
@@ -39,31 +66,88 @@ def command(
         float | None,
         typer.Option(
             "--position-tolerance",
+            rich_help_panel=LOOPS,
             help="Horizontal error, in metres, below which a pose is right. "
             "Default: 1 m, bounded by 2 % and 10 % of the size of the submaps.",
         ),
     ] = None,
     yaw_tolerance: Annotated[
         float,
-        typer.Option("--yaw-tolerance", help="Error of yaw, in degrees, below which a pose is right."),
+        typer.Option(
+            "--yaw-tolerance",
+            rich_help_panel=LOOPS,
+            help="Error of yaw, in degrees, below which a pose is right.",
+        ),
     ] = 5.0,
     sessions: Annotated[
         Path | None,
-        typer.Option("--sessions", help="CSV 'cloud,session': leave out pairs of one session."),
+        typer.Option(
+            "--sessions",
+            rich_help_panel=LOOPS,
+            help="CSV 'cloud,session': leave out pairs of one session.",
+        ),
     ] = None,
     clouds: Annotated[
         Path | None,
-        typer.Option("--clouds", help="Mission folder: use the overlap of the observed ground, too."),
+        typer.Option(
+            "--clouds",
+            rich_help_panel=LOOPS,
+            help="Mission folder: use the overlap of the observed ground, too.",
+        ),
     ] = None,
+    align: Annotated[
+        Literal["yaw", "se3", "first", "none"],
+        typer.Option(
+            "--align",
+            rich_help_panel=TRAJECTORIES,
+            help="Alignment to the truth: rotation about z and translation, any rotation and translation, by "
+            "the first pose, or none.",
+        ),
+    ] = "yaw",
+    rpe_distance: Annotated[
+        float | None,
+        typer.Option(
+            "--rpe-distance",
+            rich_help_panel=TRAJECTORIES,
+            help="Distance of relative errors, metres along the trajectory. Default: 10 m, and one pose for "
+            "the submaps of a run.",
+        ),
+    ] = None,
+    rpe_poses: Annotated[
+        int | None,
+        typer.Option(
+            "--rpe-poses",
+            rich_help_panel=TRAJECTORIES,
+            help="The same as a number of poses.",
+        ),
+    ] = None,
+    stamp_tolerance: Annotated[
+        float,
+        typer.Option(
+            "--stamp-tolerance",
+            min=0.0,
+            rich_help_panel=TRAJECTORIES,
+            help="Largest difference of the stamps of two poses that are compared, seconds.",
+        ),
+    ] = 0.01,
     as_json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
     """Run ``terrainloop evaluate``."""
+    from terrainloop.evaluation.run_trajectories import run_trajectory_errors
     from terrainloop.evaluation.summary import evaluate_run
+    from terrainloop.evaluation.trajectory_error import trajectory_error
+    from terrainloop.io.trajectories import read_trajectory
     from terrainloop.report import can_draw
 
     terminal = Terminal.open(as_json, quiet, verbose)
+    span = _span(rpe_distance, rpe_poses)
+    if _is_trajectory(run):
+        estimate, true = read_trajectory(run), read_trajectory(truth)
+        error = trajectory_error(estimate, true, align=align, span=span, stamp_tolerance=stamp_tolerance)
+        terminal.result(error.as_dict(), lambda console: show_trajectory(console, error))
+        return
     evaluation = evaluate_run(
         run,
         truth,
@@ -78,11 +162,46 @@ def command(
         from terrainloop.report.figures import figure_precision_recall, save_figure
 
         save_figure(figure_precision_recall(evaluation), run / "precision_recall.png")
-    terminal.result(evaluation.as_dict(), lambda console: show(console, evaluation))
+    errors = run_trajectory_errors(
+        run, truth, evaluation, align=align, span=span, stamp_tolerance=stamp_tolerance
+    )
+
+    result = evaluation.as_dict() | {"trajectories": {name: e.as_dict() for name, e in errors.items()}}
+    terminal.result(result, lambda console: show(console, evaluation, errors))
 
 
-def show(console: Console, evaluation: "Evaluation") -> None:
-    """The result in sentences, then the tables and their meaning."""
+def _is_trajectory(path: Path) -> bool:
+    return path.is_file() or (path.suffix == ".tum" and not path.exists())
+
+
+def _span(distance: float | None, poses: int | None) -> "Span | None":
+    """What the two options say of relative errors; None by default."""
+    from terrainloop.evaluation.trajectory_error import Span
+
+    if distance is not None and poses is not None:
+        raise TerrainLoopError(
+            expected="either --rpe-distance or --rpe-poses", found="both", mend="leave one of them out"
+        )
+    if distance is not None:
+        return Span(distance, "m")
+    return None if poses is None else Span(poses, "poses")
+
+
+def show_trajectory(console: Console, error: "TrajectoryError") -> None:
+    """Absolute and relative errors as a table, and how the trajectory was aligned."""
+    ate, rpe = count_of(len(error.absolute), "pose"), count_of(len(error.relative), "pair")
+    kinds = [("ATE", error.absolute, ate), (f"RPE over {error.span}", error.relative, rpe)]
+    rows = [
+        [f"{kind}, {unit}", count, *(_number(value, 3) for value in astuple(numbers))]
+        for kind, magnitudes, count in kinds
+        for unit, numbers in zip(("m", "deg"), magnitudes.statistics, strict=True)
+    ]
+    console.print(table_of("Trajectory errors", ["", "of", "rms", "mean", "median", "max"], rows))
+    console.print(f"\n{ALIGNED[error.alignment]} Length of the true path: {error.length:.1f} m.")
+
+
+def show(console: Console, evaluation: "Evaluation", trajectories: "Mapping[str, TrajectoryError]") -> None:
+    """The result in sentences, then the tables and their meaning, then the errors of trajectories."""
     for sentence in _sentences(evaluation):
         console.print(sentence)
     if evaluation.pairs:
@@ -90,6 +209,8 @@ def show(console: Console, evaluation: "Evaluation") -> None:
         _show_table(console, evaluation)
         _show_metrics(console, evaluation)
         _show_legend(console, evaluation)
+    for name, error in trajectories.items():
+        console.print(f"{name}: {error}.")
 
 
 def _sentences(evaluation: "Evaluation") -> list[str]:
