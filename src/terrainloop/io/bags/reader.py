@@ -33,10 +33,10 @@ _MENDS = (
     ("malformed", "repair it with 'sqlite3 BAG.db3 .recover', or copy it again"),
     ("not a database", "copy it again"),
     ("missing tables", "give the file of a ROS 2 bag"),
-    ("end magic", "install mcap (pip install mcap zstandard) to read what is there, or run 'mcap recover'"),
+    ("end magic", "install mcap (pip install mcap) to read what is there, or run 'mcap recover'"),
     (
         "Profile",
-        "install mcap (pip install mcap zstandard) to read it, or convert it with 'ros2 bag convert'",
+        "record a ROS 2 bag; if its messages are in CDR, pip install mcap reads them",
     ),
     ("decompress", "copy it again: a compressed part is damaged"),
     ("seems to be empty", "record it again"),
@@ -195,7 +195,11 @@ class Bag:
             with _errors_of(str(file)):
                 salvaged.open()
             if not salvaged.connections:
-                raise
+                raise TerrainLoopError(
+                    expected=error.expected,
+                    found=f"{error.found}, and no message of ROS 2 (CDR) before that",
+                    mend="copy it again, or record a ROS 2 bag",
+                ) from error
             self.remarks.append(
                 f"{file.name} is salvaged as far as it goes ({error.found.rpartition(': ')[2]})"
             )
@@ -217,7 +221,7 @@ def _errors_of(path: str) -> Iterator[None]:
     except (TerrainLoopError, GeneratorExit):
         raise
     except Exception as error:
-        reason = str(error).strip().partition("\n")[0] or type(error).__name__
+        reason = str(error).strip().partition("\n")[0].rstrip(".") or type(error).__name__
         mend = next(
             (mend for part, mend in _MENDS if part.lower() in reason.lower()), "copy it again, or repair it"
         )
