@@ -18,14 +18,8 @@ from scipy.spatial.transform import Rotation
 from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.run_trajectories import run_trajectory_errors
 from terrainloop.evaluation.summary import evaluate_run
-from terrainloop.evaluation.trajectory_error import (
-    Span,
-    Statistics,
-    alignment,
-    associate,
-    span_pairs,
-    trajectory_error,
-)
+from terrainloop.evaluation.trajectory_alignment import alignment, associate
+from terrainloop.evaluation.trajectory_error import Span, Statistics, span_pairs, trajectory_error
 from terrainloop.geometry import exp_se3, inverse, log_se3, se3, translation
 from terrainloop.io.trajectories import Trajectory, read_trajectory, write_tum
 

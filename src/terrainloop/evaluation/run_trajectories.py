@@ -7,13 +7,8 @@ import numpy as np
 
 from terrainloop.errors import TerrainLoopError
 from terrainloop.evaluation.summary import Evaluation
-from terrainloop.evaluation.trajectory_error import (
-    STAMP_TOLERANCE,
-    Alignment,
-    Span,
-    TrajectoryError,
-    trajectory_error,
-)
+from terrainloop.evaluation.trajectory_alignment import STAMP_TOLERANCE, Alignment
+from terrainloop.evaluation.trajectory_error import Span, TrajectoryError, trajectory_error
 from terrainloop.io.submap_poses import check_count
 from terrainloop.io.trajectories import Trajectory, read_trajectory
 
