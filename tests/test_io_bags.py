@@ -254,6 +254,14 @@ def test_poses_with_covariance(tmp_path):
     np.testing.assert_array_equal(posed.covariance, np.eye(6) * 2)
 
 
+@pytest.mark.parametrize(
+    "covariance", [np.zeros((6, 6)), -np.eye(6), np.full((6, 6), np.nan), 1e300 * np.eye(6)]
+)
+def test_covariances_that_are_none(covariance, tmp_path):
+    _, scans = recorded(write_bag(tmp_path, "mcap", lambda make: drive(make, covariance=covariance)))
+    assert all(posed.covariance is None for posed in scans)
+
+
 def test_a_camera_by_tf_or_by_its_name_or_as_asked(tmp_path):
     frame = "camera_optical_frame"
     with_tf = write_bag(

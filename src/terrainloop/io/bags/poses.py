@@ -22,6 +22,8 @@ POSE_TYPES = (
 
 _LOOSEST = 1e-2  # deviation of a quaternion's norm from 1 that rounded digits explain
 _UPPER = np.triu_indices(6)
+_UPPER_OF_36 = 6 * _UPPER[0] + _UPPER[1]
+_NO_COVARIANCE = np.full(len(_UPPER_OF_36), np.nan, dtype=np.float32).tobytes()
 
 
 def stamp_of(header: Any) -> float:
@@ -55,16 +57,12 @@ class TrackBuilder:
             self.dropped["have a quaternion that is not of norm 1"] += 1
         else:
             self.numbers.extend((stamp, *numbers))
-            self.covariances.extend(_upper_of(covariance))
+            self.covariances.frombytes(_upper_of(covariance))
 
     def track(self) -> PoseTrack:
         """The poses as a track."""
         table = np.array(self.numbers).reshape(-1, 8)
-        upper = np.array(self.covariances, dtype=np.float32).reshape(-1, len(_UPPER[0]))
-        covariances = None
-        if np.isfinite(upper).any():
-            covariances = np.empty((len(table), 6, 6), dtype=np.float32)
-            covariances[:, _UPPER[0], _UPPER[1]] = covariances[:, _UPPER[1], _UPPER[0]] = upper
+        covariances = _full(np.array(self.covariances, dtype=np.float32).reshape(-1, len(_UPPER[0])))
         return PoseTrack(table[:, 0], table[:, 1:4], table[:, 4:], covariances)
 
 
@@ -93,12 +91,19 @@ def pose_of(message: Any, kind: str) -> StampedPose:
     return StampedPose(stamp, frame, child, pose.position, pose.orientation, covariance)
 
 
-def _upper_of(covariance: Any) -> NDArray[np.float64]:
-    """The upper triangle of a covariance; NaN where it is not given: zeros, or a negative variance."""
-    unknown = np.full(len(_UPPER[0]), np.nan)
+def _upper_of(covariance: Any) -> bytes:
+    """The upper triangle of a covariance in single precision; NaN where there is none."""
     if covariance is None:
-        return unknown
-    matrix = np.asarray(covariance, dtype=np.float64).reshape(6, 6)
-    diagonal = matrix.diagonal()
-    known = np.isfinite(matrix).all() and (diagonal >= 0).all() and diagonal.any()
-    return matrix[_UPPER] if known else unknown
+        return _NO_COVARIANCE
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(covariance, dtype=np.float64)[_UPPER_OF_36].astype(np.float32).tobytes()
+
+
+def _full(upper: NDArray[np.float32]) -> NDArray[np.float32] | None:
+    """Covariances (N, 6, 6), NaN where zeros or negative variances say that there is none; None if all do."""
+    covariances = np.empty((len(upper), 6, 6), dtype=np.float32)
+    covariances[:, _UPPER[0], _UPPER[1]] = covariances[:, _UPPER[1], _UPPER[0]] = upper
+    variances = upper[:, _UPPER[0] == _UPPER[1]]
+    known = np.isfinite(upper).all(axis=1) & (variances >= 0).all(axis=1) & (variances > 0).any(axis=1)
+    covariances[~known] = np.nan
+    return covariances if known.any() else None
