@@ -99,6 +99,12 @@ def test_without_metadata_or_as_a_file(kind, tmp_path):
     assert len(recorded(path)[1]) == 6
 
 
+def test_messages_that_sqlite_has_not_stored_yet(tmp_path):
+    path = write_bag(tmp_path, "sqlite3", drive)
+    (path / "sqlite3.db3-wal").write_bytes(b"wal")
+    assert any("wal_checkpoint" in words for words in recorded(path)[0].description.remarks)
+
+
 def test_metadata_that_lists_more_files(tmp_path):
     path = write_bag(tmp_path, "mcap", drive)
     text = (path / "metadata.yaml").read_text()
@@ -295,6 +301,51 @@ def test_clouds_in_the_world_of_the_odometry_are_taken_back(tmp_path):
     for posed in scans:
         np.testing.assert_allclose(transform(posed.T_world_sensor, posed.scan.points), POINTS, atol=1e-6)
     np.testing.assert_allclose(scans[1].T_world_sensor, expected_pose(0.15), atol=1e-5)
+
+
+def test_clouds_in_a_map_above_the_odometry_are_taken_back(tmp_path):
+    def mapped(make):
+        for item in drive(make, frame="map"):
+            yield item
+            if item[0] == "/odom":
+                now = item[1]
+                yield "/tf", now, make.tf((now, "map", "odom", (5, 0, 0), LEVEL))
+                seconds = now - START
+                yield "/tf", now, make.tf((now, "odom", "base_link", (seconds, 0, 0), yaw(0.2 * seconds)))
+
+    _, scans = recorded(write_bag(tmp_path, "mcap", mapped))
+    for posed in scans:
+        in_odom = transform(posed.T_world_sensor, posed.scan.points)
+        np.testing.assert_allclose(in_odom + np.array([5, 0, 0]), POINTS, atol=1e-5)
+    np.testing.assert_allclose(scans[1].T_world_sensor, expected_pose(0.15), atol=1e-5)
+
+
+@pytest.mark.parametrize(("frame", "T_frame_points"), [("body", np.eye(4)), ("optical", T_BODY_OPTICAL)])
+def test_tf_as_odometry_of_the_body(frame, T_frame_points, tmp_path):
+    def tf_only(make):
+        yield "/tf_static", START, make.tf((START, "base_link", "lidar", (0, 0, 1), LEVEL))
+        for i in range(11):
+            now = START + 0.1 * i
+            yield "/tf", now, make.tf((now, "odom", "base_link", (0.1 * i, 0, 0), LEVEL))
+        yield "/points", START + 0.5, make.cloud(START + 0.45, POINTS)
+
+    _, (posed,) = recorded(write_bag(tmp_path, "mcap", tf_only), sensor_frame=frame)
+    np.testing.assert_allclose(posed.T_world_sensor, se3(0.45, 0, 0, 0, 0, 0) @ T_frame_points, atol=1e-6)
+
+
+def test_planar_odometry_is_noted(tmp_path):
+    def notes(folder, height):
+        folder.mkdir()
+        path = write_bag(folder, "mcap", lambda make: drive_at(make, height))
+        return " ".join(open_recording(path).description.remarks)
+
+    def drive_at(make, height):
+        for i in range(4):
+            yield "/odom", START + i, make.odometry(START + i, (i, 0, height * i))
+            yield "/points", START + i, make.cloud(START + i, POINTS)
+
+    assert "/odom is planar" in notes(tmp_path / "flat", 0.0)
+    assert "planar" not in notes(tmp_path / "hilly", 0.1)
 
 
 def test_frames_that_are_not_joined_are_missing(tmp_path):

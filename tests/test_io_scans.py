@@ -106,6 +106,16 @@ def test_poses_that_do_not_fit_are_refused(tmp_path):
         open_recording(tmp_path)
 
 
+@pytest.mark.parametrize("prefix", ["", "scan_", "run_1_"])
+def test_counters_in_names_are_no_stamps(prefix, tmp_path):
+    """Although they are within the time span of the poses."""
+    write_scans(tmp_path, [prefix + name for name in numbers()])
+    poses = np.array([se3(i, 0, 0, 0, 0, 0) for i in range(20)])
+    write_tum(tmp_path / "poses.tum", Trajectory(np.arange(20.0), poses))
+    with pytest.raises(TerrainLoopError, match="6 poses, one for each scan"):
+        open_recording(tmp_path)
+
+
 def test_poses_of_a_camera_and_of_its_body(tmp_path):
     write_scans(tmp_path, numbers())
     write_tum(tmp_path / "poses.tum", Trajectory(np.arange(6.0), POSES @ T_BODY_OPTICAL))

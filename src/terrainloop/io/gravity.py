@@ -10,6 +10,8 @@ T_BODY_OPTICAL = np.array(
 )
 """From the frame of a camera (x right, y down, z forward) into that of a body (x forward, y left, z up)."""
 
+_PLANAR = 1e-4  # metres of height and radians of tilt within which odometry does not know of any ...
+_DRIVEN = 1.0  # ... although it has come so many metres from its start
 _STEEPEST = np.cos(np.radians(45.0))  # a rover's body is tilted less than this for most of a drive
 _UPRIGHT = np.cos(np.radians(30.0))  # of an axis that is vertical for all of a drive
 
@@ -36,3 +38,10 @@ def why_not_upright(rotations: Array, frame: str) -> str:
         tilt = np.degrees(np.arccos(np.median(up)))
         return f"{frame or 'its frame'} is tilted by {tilt:.0f} deg in the median"
     return ""
+
+
+def is_planar(positions: Array, rotations: Array) -> bool:
+    """Whether positions (N, 3) and rotations (N, 3, 3) of a drive stay in a plane, as those of wheels."""
+    driven = np.hypot(*np.ptp(positions[:, :2], axis=0))
+    level = np.abs(rotations[:, 2, :2]).max() < _PLANAR and np.ptp(positions[:, 2]) < _PLANAR
+    return bool(driven > _DRIVEN and level)

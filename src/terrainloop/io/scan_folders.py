@@ -29,6 +29,7 @@ _FOLDERS = (CLOUDS, "scans", "velodyne", "velodyne_points/data", "lidar", ".")
 _TRAJECTORIES = ("poses.tum", "odometry.tum", "poses.txt", "odometry.txt")
 _TEXTS = (".txt", ".csv")  # in the folder itself these hold trajectories and notes
 _TIMES, _CALIBRATION = "times.txt", "calib.txt"
+_SHORTEST_STEP = 1e-3  # seconds between two scans
 _LARGEST_TEXT = 64 << 20  # bytes
 _MISSION_KIND = "mission of submaps"
 _NO_ODOMETRY = "no odometry.tum, which 'terrainloop slam' needs, one pose for each submap"
@@ -228,7 +229,7 @@ def _posed(files: Sequence[Path], trajectory: Trajectory, source: Path) -> _Pose
         return _Posed(ordered, trajectory.stamps, tuple(trajectory.poses))
     track = PoseTrack.of(trajectory)
     first, last = track.span
-    readings = [times for times, _ in times_in_names(names)]
+    readings = [times for times, surely in times_in_names(names) if surely and _is_rate(times)]
     inside = [int(((times >= first) & (times <= last)).sum()) for times in readings]
     if not any(inside):
         raise TerrainLoopError(
@@ -239,6 +240,11 @@ def _posed(files: Sequence[Path], trajectory: Trajectory, source: Path) -> _Pose
         )
     stamps = readings[int(np.argmax(inside))]
     return _Posed(tuple(files), stamps, tuple(track.at(float(stamp)) for stamp in stamps))
+
+
+def _is_rate(times: Array) -> bool:
+    """Whether scans could be taken at these times; not so if they are counters."""
+    return len(times) < 2 or float(np.median(np.diff(np.sort(times)))) > _SHORTEST_STEP
 
 
 def _tilted(trajectory: Trajectory, source: Path) -> tuple[str, ...]:

@@ -30,6 +30,11 @@ def find_files(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
         files, words = _files_in(path) if path.is_dir() else ([path], [])
         found += files
         remarks += words
+    remarks += [
+        f"{file.name}-wal holds messages that are not read: run sqlite3 {file.name} 'PRAGMA wal_checkpoint'"
+        for file in found
+        if _size(file.with_name(f"{file.name}-wal"))
+    ]
     ros1 = [file for file in found if file.suffix.lower() == ".bag"]
     if 0 < len(ros1) < len(found):
         other = next(file for file in found if file not in ros1)
@@ -61,6 +66,10 @@ def _files_in(folder: Path) -> tuple[list[Path], list[str]]:
         missing = sorted(_listed(text) - {file.name for file in files})
         return files, [f"{len(missing)} files that {_METADATA} lists are missing"] if missing else []
     return files, []
+
+
+def _size(file: Path) -> int:
+    return file.stat().st_size if file.is_file() else 0
 
 
 def _text_of(metadata: Path) -> str:

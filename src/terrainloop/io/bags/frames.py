@@ -99,9 +99,11 @@ class Frames:
         return next((each for each in reversed(fixed) if not any(_is(each, name) for name in _WORLDS)), frame)
 
     def world_of(self, frame: str) -> str | None:
-        """The frame of an odometry in which a sensor moves; None where TF tells of no motion."""
+        """The frame of an odometry in which a sensor moves; None where TF tells of no motion of it."""
         line = self._ancestry(frame)
         edges = self._tree()
+        if any(_is(frame, name) for name in _WORLDS):
+            return None
         moving = [i for i, each in enumerate(line[:-1]) if not edges[each].constant]
         if not moving:
             return None

@@ -14,7 +14,7 @@ from terrainloop.io.bags.depth import IMAGE
 from terrainloop.io.bags.frames import Frames, Link
 from terrainloop.io.bags.poses import TrackBuilder, pose_of
 from terrainloop.io.bags.reader import TF, Bag, Topic
-from terrainloop.io.gravity import T_BODY_OPTICAL, is_optical, why_not_upright
+from terrainloop.io.gravity import T_BODY_OPTICAL, is_optical, is_planar, why_not_upright
 from terrainloop.io.pose_track import PoseTrack
 from terrainloop.scan import PosedScan, Scan
 
@@ -75,25 +75,25 @@ class Placement:
             dropped[_OUTSIDE] += 1
             return None
         covariance = None if self.track is None else self.track.covariance_at(scan.stamp)
-        if mount.registered:
-            points = transform(inverse(T_world_body), scan.points)
-            return PosedScan(Scan(points, scan.stamp, scan.intensity), T_world_body, covariance)
-        return PosedScan(scan, T_world_body @ T_body_sensor @ mount.T_frame_points, covariance)
+        if not mount.registered:
+            return PosedScan(scan, T_world_body @ T_body_sensor @ mount.T_frame_points, covariance)
+        T_body_points = inverse(T_world_body) if mount.link == Link() else T_body_sensor
+        points = transform(T_body_points, scan.points)
+        return PosedScan(Scan(points, scan.stamp, scan.intensity), T_world_body, covariance)
 
     def _found_mount(self, frame: str) -> "Mount | None":
-        if self.sensor_frame == "body":
-            return Mount(Link())
-        if self.sensor_frame == "optical":
-            return Mount(Link(), T_BODY_OPTICAL)
         named = frame if self.sensor_frame == "auto" else self.sensor_frame
+        if self.sensor_frame in ("body", "optical"):
+            named = self.body
+        T_frame_points = T_BODY_OPTICAL if self.sensor_frame == "optical" else np.eye(4)
         if self.track is None:
             link = self.frames.link(self.world, named)
-            return None if link is None else Mount(link)
+            return None if link is None else Mount(link, T_frame_points)
         if self.world and named == self.world:
             return Mount(Link(), registered=True)
         link = self.frames.link(self.body, named)
-        if link is not None:
-            return Mount(link)
+        if link is not None:  # a frame above the body, in which it moves, is that of a map
+            return Mount(link, T_frame_points, registered=not link.from_source and not link.constant)
         if self.sensor_frame != "auto" or len(self.frames):
             return None
         return Mount(Link(), T_BODY_OPTICAL if self.optical_without_tf else np.eye(4))
@@ -110,7 +110,7 @@ class Mount:
     T_frame_points : array, (4, 4)
         The turn out of an optical frame that TF does not know.
     registered : bool
-        Whether the points are in the world already.
+        Whether the points are in the world of the odometry, or that of a map, already.
     """
 
     link: Link
@@ -177,7 +177,7 @@ def _check(placement: Placement, frame: str, poses: Topic, track: PoseTrack) -> 
             "/tf_static, or give --sensor-frame body (scans in that frame) or optical (a camera, z forward)"
         )
     elif mount.registered:
-        placement.remarks.append(f"the scans are in the odometry's world {frame!r}: taken back into {body!r}")
+        placement.remarks.append(f"the scans are in the fixed frame {frame!r}: taken back into {body!r}")
     elif mount.T_frame_points is T_BODY_OPTICAL and placement.sensor_frame == "auto":
         placement.remarks.append(
             f"no TF from {frame!r} to {body!r}: turned out of the optical frame, taken as mounted level at "
@@ -187,6 +187,11 @@ def _check(placement: Placement, frame: str, poses: Topic, track: PoseTrack) -> 
         placement.remarks.append(
             f"no TF from {frame!r} to {body!r}: taken as the same frame; where the sensor is mounted with a "
             "tilt, record /tf_static"
+        )
+    if is_planar(track.positions, track.rotations):
+        placement.remarks.append(
+            f"{poses.name} is planar (level, at one height): on slopes its world is not gravity-aligned; "
+            "better use odometry in three dimensions"
         )
     if why := why_not_upright(track.rotations, body):
         placement.missing.append(

@@ -34,10 +34,7 @@ _MENDS = (
     ("not a database", "copy it again"),
     ("missing tables", "give the file of a ROS 2 bag"),
     ("end magic", "install mcap (pip install mcap) to read what is there, or run 'mcap recover'"),
-    (
-        "Profile",
-        "record a ROS 2 bag; if its messages are in CDR, pip install mcap reads them",
-    ),
+    ("Profile", "record a ROS 2 bag; if its messages are in CDR, pip install mcap reads them"),
     ("decompress", "copy it again: a compressed part is damaged"),
     ("seems to be empty", "record it again"),
     ("not supported", "convert it with 'ros2 bag convert' or 'rosbag decompress'"),
@@ -130,10 +127,6 @@ class Bag:
         """All topics, by name."""
         return tuple(self._connections)
 
-    def knows(self, topic: Topic) -> bool:
-        """Whether messages of the topic can be decoded."""
-        return topic.type in self._store.fielddefs
-
     def has_header(self, topic: Topic) -> bool:
         """Whether messages of the topic can be decoded and carry a header."""
         fields = self._store.fielddefs.get(topic.type, ([], []))[1]
@@ -159,7 +152,7 @@ class Bag:
 
     def last(self, topic: Topic) -> bytes | None:
         """The last message of a topic by bag time."""
-        for source, connection in self._connections[topic]:
+        for source, connection in reversed(self._connections[topic]):
             if isinstance(source, SalvagedMcap):  # which has no index to look it up
                 return source.last[connection.id]
         with _errors_of(self.path):
