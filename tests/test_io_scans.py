@@ -76,8 +76,8 @@ def test_kitti(tmp_path):
     np.testing.assert_array_equal(scan.intensity, np.arange(len(POINTS)))
     (tmp_path / "calib.txt").unlink()
     (missing,) = open_recording(tmp_path).description.missing
-    assert "y axis vertical" in missing
-    assert "calib.txt" in missing
+    assert "y axis vertical" in missing.what
+    assert "calib.txt" in missing.fix
 
 
 def test_stamps_in_names_are_interpolated(tmp_path):
@@ -130,7 +130,7 @@ def test_without_poses(tmp_path):
     write_scans(tmp_path, numbers())
     recording = open_recording(tmp_path)
     assert recording.count == 6
-    assert recording.description.missing[0].startswith("no poses of the scans: put one of poses.tum")
+    assert str(recording.description.missing[0]).startswith("no poses of the scans: put one of poses.tum")
     with pytest.raises(TerrainLoopError, match="no poses"):
         list(recording.scans())
 
@@ -169,7 +169,7 @@ def test_a_mission_with_truth_alone(tmp_path):
     write_tum(tmp_path / "truth.tum", Trajectory(np.arange(6.0), POSES))
     recording = open_recording(tmp_path)
     assert recording.kind == "mission of submaps"
-    assert recording.description.missing[0].startswith("no odometry.tum")
+    assert recording.description.missing[0].what.startswith("no odometry.tum")
     write_tum(tmp_path / "odometry.tum", Trajectory(np.arange(6.0), POSES))
     check(list(open_recording(tmp_path).scans()))
 

@@ -69,7 +69,7 @@ def summarise(recording: "Recording") -> dict[str, Any]:
         "scans": recording.count,
         "streams": [asdict(stream) for stream in description.streams],
         "remarks": list(description.remarks),
-        "missing": list(description.missing),
+        "missing": [str(missing) for missing in description.missing],
     }
 
 
@@ -82,8 +82,8 @@ def show(console: Console, recording: "Recording") -> None:
     console.print()
     for words in description.remarks:
         console.print(printable(f"Note: {words}."))
-    for words in description.missing:
-        console.print(printable(f"Missing: {words}."))
+    for missing in description.missing:
+        console.print(printable(f"Missing: {missing}."))
     if description.missing:
         console.print("It cannot be used as it is.")
     else:

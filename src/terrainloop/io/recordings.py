@@ -48,6 +48,17 @@ class Stream:
 
 
 @dataclass(frozen=True)
+class Missing:
+    """What keeps a recording from being used, and what to do about it."""
+
+    what: str
+    fix: str
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.fix}"
+
+
+@dataclass(frozen=True)
 class Description:
     """What a recording holds, what would be used of it, and what is missing.
 
@@ -59,15 +70,15 @@ class Description:
     streams : tuple of Stream
     remarks : tuple of str
         What was chosen and assumed, in sentences.
-    missing : tuple of str
-        What keeps the recording from being used, each with what to do about it; empty if it can be used.
+    missing : tuple of Missing
+        Empty if the recording can be used.
     """
 
     kind: str
     path: str
     streams: tuple[Stream, ...]
     remarks: tuple[str, ...] = ()
-    missing: tuple[str, ...] = ()
+    missing: tuple[Missing, ...] = ()
 
 
 @dataclass(eq=False, repr=False)
@@ -110,8 +121,8 @@ class Recording:
         TerrainLoopError
             If something is missing, no scan remains, or the recording is damaged.
         """
-        if self.description.missing:
-            raise self._unusable("; ".join(self.description.missing))
+        for missing in self.description.missing:
+            raise self._unusable(missing.what, missing.fix)
         self.dropped.clear()
         used = 0
         for scan in self._read(self.dropped):
@@ -119,15 +130,15 @@ class Recording:
             yield scan
         words = "; ".join(f"{count} {reason}" for reason, count in self.dropped.items())
         if not used:
-            raise self._unusable(f"no scan that can be used: {words or 'none recorded'}")
+            raise self._unusable(
+                f"no scan that can be used: {words or 'none recorded'}", "see what 'terrainloop info' reports"
+            )
         if words:
             logger.warning("%s: dropped scans: %s", self.description.path, words)
 
-    def _unusable(self, found: str) -> TerrainLoopError:
+    def _unusable(self, found: str, mend: str) -> TerrainLoopError:
         return TerrainLoopError(
-            expected="scans and odometry of one clock",
-            found=f"{self.description.path}: {found}",
-            mend="'terrainloop info' lists all that is in it",
+            expected="scans with odometry", found=f"{self.description.path}: {found}", mend=mend
         )
 
 

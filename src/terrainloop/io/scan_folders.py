@@ -17,7 +17,7 @@ from terrainloop.io.gravity import T_BODY_OPTICAL, why_not_upright
 from terrainloop.io.missions import CLOUDS, load_mission
 from terrainloop.io.ordering import order_of_names, times_in_names
 from terrainloop.io.pose_track import PoseTrack
-from terrainloop.io.recordings import Description, Recording, Sensor, Stream, no_scans
+from terrainloop.io.recordings import Description, Missing, Recording, Sensor, Stream, no_scans
 from terrainloop.io.trajectories import Trajectory, read_trajectory
 from terrainloop.scan import PosedScan, Scan
 
@@ -32,7 +32,7 @@ _TIMES, _CALIBRATION = "times.txt", "calib.txt"
 _SHORTEST_STEP = 1e-3  # seconds between two scans
 _LARGEST_TEXT = 64 << 20  # bytes
 _MISSION_KIND = "mission of submaps"
-_NO_ODOMETRY = "no odometry.tum, which 'terrainloop slam' needs, one pose for each submap"
+_NO_ODOMETRY = Missing("no odometry.tum, which 'terrainloop slam' needs", "write one pose for each submap")
 _OUTSIDE = "outside the time span of the poses, or in a gap of them"
 
 
@@ -102,11 +102,11 @@ def _scans_of(folder: Path, sensor_frame: str) -> Recording:
     return Recording(description, sensor, len(files), partial(_posed_scans, posed, T_frame_points))
 
 
-def _no_poses(folder: Path) -> str:
-    return (
-        f"no poses of the scans: put one of {', '.join(_TRAJECTORIES)} into {folder} (TUM: stamp tx ty tz "
-        "qx qy qz qw; KITTI: 12 numbers), one line for each scan in the order of the names, or run an "
-        "odometry (such as KISS-ICP) to get them"
+def _no_poses(folder: Path) -> Missing:
+    return Missing(
+        "no poses of the scans",
+        f"put one of {', '.join(_TRAJECTORIES)} (TUM or KITTI) into {folder}, one line for each scan in the "
+        "order of the names; an odometry such as KISS-ICP makes them",
     )
 
 
@@ -247,7 +247,7 @@ def _is_rate(times: Array) -> bool:
     return len(times) < 2 or float(np.median(np.diff(np.sort(times)))) > _SHORTEST_STEP
 
 
-def _tilted(trajectory: Trajectory, source: Path) -> tuple[str, ...]:
+def _tilted(trajectory: Trajectory, source: Path) -> tuple[Missing, ...]:
     """Why the poses are of no use, if neither a body nor a camera is upright in their world."""
     rotations = trajectory.poses[:, :3, :3]
     why = why_not_upright(rotations, "")
@@ -255,7 +255,7 @@ def _tilted(trajectory: Trajectory, source: Path) -> tuple[str, ...]:
         return ()
     calibrate = f", or put KITTI's {_CALIBRATION} (Tr) beside them" if "y axis" in why else ""
     words = f"the poses in {source.name} are not gravity-aligned: {why}"
-    return (f"{words}; give them in a world with z up{calibrate}",)
+    return (Missing(words, f"give them in a world with z up{calibrate}"),)
 
 
 def _clouds_stream(posed: _Posed, use: str) -> Stream:

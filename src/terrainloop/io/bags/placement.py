@@ -16,10 +16,12 @@ from terrainloop.io.bags.poses import TrackBuilder, pose_of
 from terrainloop.io.bags.reader import TF, Bag, Topic
 from terrainloop.io.gravity import T_BODY_OPTICAL, is_optical, is_planar, why_not_upright
 from terrainloop.io.pose_track import PoseTrack
+from terrainloop.io.recordings import Missing
 from terrainloop.scan import PosedScan, Scan
 
 Array = NDArray[np.float64]
 
+_ALIGN = "publish odometry in a world with z up (with an IMU, in the frames of REP 105)"
 _OTHER_FRAME = "in a frame that TF does not join to the odometry's"
 _OUTSIDE = "outside the time span of the odometry, or in a gap of it"
 
@@ -39,7 +41,8 @@ class Placement:
         As asked for: "auto", "optical", "body" or the name of a frame.
     optical_without_tf : bool
         Whether scans of a frame that TF does not know are in that of a camera.
-    remarks, missing : list of str
+    remarks : list of str
+    missing : list of Missing
     """
 
     world: str
@@ -49,7 +52,7 @@ class Placement:
     sensor_frame: str
     optical_without_tf: bool
     remarks: list[str] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)
+    missing: list[Missing] = field(default_factory=list)
     _mounts: dict[str, "Mount | None"] = field(default_factory=dict)
 
     @property
@@ -143,7 +146,7 @@ def placement_of(bag: Bag, scans: Scans, poses: Topic | None, sensor_frame: str)
     optical = is_optical(named) or scans.topic.type == IMAGE
     placement = Placement(world, body, track, frames, sensor_frame, optical, remarks)
     if track is None:
-        placement.missing.append(f"{poses.name} holds no pose that can be used: record it again")
+        placement.missing.append(Missing(f"{poses.name} holds no pose that can be used", "record it again"))
         return placement
     if not body and sensor_frame not in ("optical", "body"):
         body = _unnamed_body(frames, named, track)
@@ -173,8 +176,10 @@ def _check(placement: Placement, frame: str, poses: Topic, track: PoseTrack) -> 
     body = placement.body
     if mount is None:
         placement.missing.append(
-            f"TF does not join the frame {frame!r} of the scans to {body!r} of {poses.name}: record "
-            "/tf_static, or give --sensor-frame body (scans in that frame) or optical (a camera, z forward)"
+            Missing(
+                f"no TF that joins the frame {frame!r} of the scans to {body!r} of {poses.name}",
+                "record /tf_static, or give --sensor-frame body (scans in that frame) or optical (a camera)",
+            )
         )
     elif mount.registered:
         placement.remarks.append(f"the scans are in the fixed frame {frame!r}: taken back into {body!r}")
@@ -194,10 +199,7 @@ def _check(placement: Placement, frame: str, poses: Topic, track: PoseTrack) -> 
             "better use odometry in three dimensions"
         )
     if why := why_not_upright(track.rotations, body):
-        placement.missing.append(
-            f"the odometry {poses.name} is not gravity-aligned: {why}; publish it in a world with z up "
-            "(with an IMU, in the frames of REP 105)"
-        )
+        placement.missing.append(Missing(f"{poses.name} is not gravity-aligned: {why}", _ALIGN))
 
 
 def _from_tf(frames: Frames, frame: str, sensor_frame: str) -> Placement | None:
@@ -212,7 +214,8 @@ def _from_tf(frames: Frames, frame: str, sensor_frame: str) -> Placement | None:
     stamps: Sequence[float] = moving[0].track.stamps.tolist() if moving else []
     poses = [T for stamp in stamps if link is not None and (T := link.at(stamp)) is not None]
     if poses and (why := why_not_upright(np.array(poses)[:, :3, :3], body)):
-        placement.missing.append(f"{body!r} in {world!r} of TF is not gravity-aligned: {why}")
+        what = f"{body!r} in {world!r} of TF is not gravity-aligned: {why}"
+        placement.missing.append(Missing(what, _ALIGN))
     return placement
 
 

@@ -18,7 +18,7 @@ from terrainloop.io.bags.hints import no_clouds, no_poses
 from terrainloop.io.bags.placement import Placement, placement_of
 from terrainloop.io.bags.poses import POSE_TYPES, frame_of, pose_of, stamp_of
 from terrainloop.io.bags.reader import TF, Bag, Topic
-from terrainloop.io.recordings import Description, Recording, Stream, no_scans
+from terrainloop.io.recordings import Description, Missing, Recording, Stream, no_scans
 from terrainloop.scan import PosedScan, Scan
 
 logger = logging.getLogger(__name__)
@@ -81,7 +81,7 @@ def _missing(
     poses: Topic | None,
     placement: Placement | None,
     streams: Sequence[Stream],
-) -> list[str]:
+) -> list[Missing]:
     """What keeps the bag from being used, and what to do about it."""
     missing = []
     if scans is None:
@@ -90,28 +90,28 @@ def _missing(
             missing.append(no_poses(bag.topics))
         return missing
     if scans.topic.type != CLOUD and scans.camera is None:
-        missing.append(
-            f"no CameraInfo with a calibration for {scans.topic.name}: record it beside the images"
-        )
+        what = f"no CameraInfo with a calibration for {scans.topic.name}"
+        missing.append(Missing(what, "record it beside the images"))
     if placement is None:
         return [*missing, no_poses(bag.topics)]
     stream = next(s for s in streams if (s.name, s.type) == (scans.topic.name, scans.topic.type))
     return [*missing, *placement.missing, *_clock_trouble(stream, placement)]
 
 
-def _clock_trouble(scans: Stream, placement: Placement) -> list[str]:
+def _clock_trouble(scans: Stream, placement: Placement) -> list[Missing]:
     """Why no scan would have a pose, by the stamps alone."""
     stamps = [stamp for stamp in (scans.start, scans.end) if stamp is not None and stamp > 0]
     if not stamps:
-        return [f"the headers of {scans.name} have no stamps: set header.stamp when they are recorded"]
+        return [Missing(f"no stamps in the headers of {scans.name}", "set header.stamp when recording")]
     if placement.span is None:
         return []
     first, last = placement.span
     if max(stamps) < first or last < min(stamps):
-        return [
+        what = (
             f"the stamps of {scans.name} ({min(stamps):.3f} to {max(stamps):.3f} s) and of the odometry "
-            f"({first:.3f} to {last:.3f} s) do not meet: stamp both by one clock (use_sim_time, or PTP)"
-        ]
+            f"({first:.3f} to {last:.3f} s) do not meet"
+        )
+        return [Missing(what, "stamp both by one clock (use_sim_time, or PTP)")]
     return []
 
 
@@ -124,12 +124,12 @@ def _stream_of(bag: Bag, topic: Topic, use: str) -> Stream:
         return stream
     first, raw = first_whole(bag, topic), bag.last(topic)
     last = None if raw is None else bag.decode(topic, raw)
-    if first is None or last is None:
+    if first is None:
         return stream
-    frame = frame_of(first.header.frame_id)
+    frame, end = frame_of(first.header.frame_id), None if last is None else stamp_of(last.header)
     if topic.type in POSE_TYPES and (child := pose_of(first, topic.type).child):
         frame = f"{child} in {frame}"
-    return replace(stream, frame=frame, start=stamp_of(first.header), end=stamp_of(last.header))
+    return replace(stream, frame=frame, start=stamp_of(first.header), end=end)
 
 
 def _posed_scans(
