@@ -174,6 +174,21 @@ def test_a_mission_with_truth_alone(tmp_path):
     check(list(open_recording(tmp_path).scans()))
 
 
+def test_scans_with_poses_and_truth_are_no_mission(tmp_path):
+    write_scans(tmp_path, numbers())
+    for name in ("poses.tum", "truth.tum"):
+        write_tum(tmp_path / name, Trajectory(np.arange(6.0), POSES))
+    recording = open_recording(tmp_path)
+    assert recording.kind == "folder of scans (cloud files)"
+    check(list(recording.scans()))
+
+
+def test_hidden_files_are_no_scans(tmp_path):
+    write_scans(tmp_path, [".0", ".1"])
+    with pytest.raises(TerrainLoopError, match="found neither"):
+        open_recording(tmp_path)
+
+
 def test_folders_without_scans(tmp_path):
     with pytest.raises(TerrainLoopError, match=r"a bag, or scans .*; found neither"):
         open_recording(tmp_path)

@@ -65,6 +65,8 @@ def open_folder_recording(folder: Path, sensor_frame: str) -> Recording:
 
 def _mission_of(folder: Path) -> Recording | None:
     """The folder as a mission of submaps; None where it is not one by its trajectories."""
+    if any((folder / f"poses{suffix}").is_file() for suffix in (".tum", ".txt")):
+        return None
     try:
         mission = load_mission(folder)
     except TerrainLoopError as error:
@@ -145,9 +147,9 @@ def _files_in(folder: Path) -> list[Path]:
             suffixes = [s for s in SCAN_SUFFIXES if name != "." or s not in _TEXTS]
             place = folder / name
             inside = sorted(place.iterdir()) if place.is_dir() else []
-            files = [file for file in inside if file.suffix.lower() in suffixes and file.is_file()]
-            if files:
-                return [file for file in files if not file.name.startswith(".")]
+            visible = [file for file in inside if not file.name.startswith(".") and file.is_file()]
+            if files := [file for file in visible if file.suffix.lower() in suffixes]:
+                return files
     except OSError as error:
         raise TerrainLoopError(
             expected=f"to read the folder {folder}", found=str(error.strerror), mend="check its permissions"
@@ -179,7 +181,7 @@ def _calibrated(trajectory: Trajectory, source: Path, scans: Path) -> tuple[Traj
     if times is not None and len(times) == len(stamps):
         stamps = times
         remarks.append(f"stamps from {_TIMES}")
-    calibration = _beside(_CALIBRATION, source, scans)
+    calibration = _beside(_CALIBRATION, source, scans) if indices and source.suffix == ".txt" else None
     T_camera_scanner = None if calibration is None else _tr_of(calibration)
     if T_camera_scanner is not None:
         poses = inverse(T_camera_scanner) @ poses @ T_camera_scanner
