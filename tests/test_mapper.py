@@ -16,7 +16,7 @@ from terrainloop.io.clouds import read_cloud
 from terrainloop.io.trajectories import Trajectory, read_trajectory, write_tum
 from terrainloop.scan import PosedScan, Scan
 from terrainloop.slam.mapper import Mapper
-from terrainloop.slam.run import PRODUCTS, slam
+from terrainloop.slam.run import PRODUCTS, run_slam
 from terrainloop.slam.submapping import Submapper
 
 REACH, RADIUS, STEP, LAPS = 4.0, 7.0, 0.5, 1.5
@@ -188,7 +188,7 @@ def test_an_interrupt_leaves_what_was_found_by_then(drive, tmp_path):
         yield from posed[:30]
         raise KeyboardInterrupt
 
-    result = slam(scans(), output=tmp_path)
+    result = run_slam(scans(), output=tmp_path)
     assert not result.run.complete
     assert not Run.read(tmp_path).complete
     assert len(read_trajectory(tmp_path / "trajectory.tum")) == 30
@@ -197,13 +197,13 @@ def test_an_interrupt_leaves_what_was_found_by_then(drive, tmp_path):
 def test_scans_without_ground_are_an_error_and_leave_nothing(tmp_path):
     empty = [PosedScan(Scan(np.empty((0, 3)), float(k)), np.eye(4)) for k in range(5)]
     with pytest.raises(TerrainLoopError, match="scans of which a submap can be made"):
-        slam(empty, output=tmp_path / "out")
+        run_slam(empty, output=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_the_same_scans_give_the_same_bytes(drive, tmp_path):
     posed, _ = drive
     for name, workers in (("a", 1), ("b", 2)):
-        slam(posed[:50], submapper=Submapper(length=4.0), output=tmp_path / name, workers=workers)
+        run_slam(posed[:50], submapper=Submapper(length=4.0), output=tmp_path / name, workers=workers)
     for path in (tmp_path / "a").iterdir():
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()

@@ -14,11 +14,11 @@ from terrainloop.detection.detector import LoopDetector
 from terrainloop.detection.flat_field import MIN_SUBMAPS
 from terrainloop.detection.mission import detect_mission
 from terrainloop.detection.run import Run
-from terrainloop.detection.sensor_pattern import SensorPatterns, hull_overlap
+from terrainloop.detection.sensor_pattern import SensorPatterns
 from terrainloop.entry import MapEntry
 from terrainloop.geometry import se2, se3, transform, yaw_of
 from terrainloop.io.clouds import write_cloud
-from terrainloop.record import SubmapRecord
+from terrainloop.record import SubmapRecord, hull_overlap
 
 SETTINGS = Settings()
 COUNT = 12

@@ -21,7 +21,11 @@ if TYPE_CHECKING:
     from terrainloop.io.recordings import Recording, open_recording
     from terrainloop.loop import LoopCandidate
     from terrainloop.matching.register import register
+    from terrainloop.pose_graph import PoseGraph, Solution
     from terrainloop.scan import PosedScan, Scan
+    from terrainloop.slam.mapper import Mapper
+    from terrainloop.slam.run import SlamRun, run_slam
+    from terrainloop.slam.submapping import Submapper
     from terrainloop.submap import Submap
 
 _HOME = {
@@ -31,13 +35,18 @@ _HOME = {
     "LoopCandidate": "loop",
     "LoopDetector": "detection.detector",
     "MapEntry": "entry",
+    "Mapper": "slam.mapper",
     "Mission": "io.missions",
+    "PoseGraph": "pose_graph",
     "PosedScan": "scan",
     "Recording": "io.recordings",
     "Run": "detection.run",
     "Scan": "scan",
     "Settings": "config",
+    "SlamRun": "slam.run",
+    "Solution": "pose_graph",
     "Submap": "submap",
+    "Submapper": "slam.submapping",
     "TerrainLoopError": "errors",
     "detect_mission": "detection.mission",
     "fit_hyperparameters": "gp.hyperparameters",
@@ -47,6 +56,7 @@ _HOME = {
     "read_crs": "io.clouds",
     "read_scan": "io.clouds",
     "register": "matching.register",
+    "run_slam": "slam.run",
     "write_cloud": "io.clouds",
 }
 
@@ -57,13 +67,18 @@ __all__ = [
     "LoopCandidate",
     "LoopDetector",
     "MapEntry",
+    "Mapper",
     "Mission",
+    "PoseGraph",
     "PosedScan",
     "Recording",
     "Run",
     "Scan",
     "Settings",
+    "SlamRun",
+    "Solution",
     "Submap",
+    "Submapper",
     "TerrainLoopError",
     "detect_mission",
     "fit_hyperparameters",
@@ -73,6 +88,7 @@ __all__ = [
     "read_crs",
     "read_scan",
     "register",
+    "run_slam",
     "write_cloud",
 ]
 

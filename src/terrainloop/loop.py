@@ -68,8 +68,9 @@ class LoopCandidate(ReadOnlyArrays):
     accepted : bool
     reason : str
         Why it was accepted or rejected, in words.
-    found_by : {"dense", "sparse", ""}
-        What proposed the pose: the search of all poses, or keypoints (Algorithm 1).
+    found_by : {"dense", "sparse", "second look", ""}
+        What proposed the pose: the search of all poses, keypoints (Algorithm 1), or a search where the
+        corrected trajectory lays the two upon each other.
     correlation : float
         Correlation of the two gradient fields over the shared ground, -1 to 1; NaN if not computed.
     log_nfa : float

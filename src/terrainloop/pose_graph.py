@@ -241,6 +241,11 @@ class Solution:
         """The loops that were kept."""
         return [loop for loop, kept in zip(self.graph.loops, self.kept, strict=True) if kept]
 
+    @property
+    def loop_ends(self) -> Array:
+        """Positions (L, 2, 2) of target and source of each loop that was kept: (x, y), metres."""
+        return np.asarray(self.poses[self.graph.edges[self.kept], :2, 3])
+
     def write_g2o(self, path: str | Path) -> None:
         """Write the poses, the steps of odometry and the loops that were kept, as a g2o file.
 
@@ -329,7 +334,7 @@ class _Problem:
 
     @classmethod
     def of(cls, graph: PoseGraph) -> "_Problem":
-        gtsam = _gtsam()
+        gtsam = require_gtsam()
         up = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
         level = gtsam.noiseModel.Isotropic.Sigma(2, np.radians(GRAVITY_DEG))
 
@@ -393,7 +398,8 @@ class _Problem:
         return values
 
 
-def _gtsam() -> ModuleType:
+def require_gtsam() -> ModuleType:
+    """GTSAM, or a TerrainLoopError where it is not installed."""
     try:
         import gtsam
     except ImportError as error:

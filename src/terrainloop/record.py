@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
@@ -59,3 +60,13 @@ class SubmapRecord:
 def _hull_of(xy: NDArray[np.float64]) -> NDArray[np.float64]:
     corners = xy[ConvexHull(xy - xy[0]).vertices]
     return np.round(corners, 3) + 0.0  # no negative zeros
+
+
+def hull_overlap(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Intersection over union of two convex polygons (K, 2) and (M, 2), anticlockwise, metres, 0 to 1."""
+    if not len(a) or not len(b):
+        return 0.0
+    middle = b.mean(axis=0)  # single precision is enough about it
+    first, second = ((corners - middle).astype(np.float32) for corners in (a, b))
+    shared, _ = cv2.intersectConvexConvex(first, second)
+    return float(shared / max(cv2.contourArea(first) + cv2.contourArea(second) - shared, 1e-30))

@@ -4,6 +4,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 from rich.console import Console
 
@@ -74,7 +75,7 @@ def command(
     """Run ``terrainloop slam``."""
     from terrainloop.io.recordings import open_recording
     from terrainloop.io.trajectories import read_trajectory
-    from terrainloop.slam.run import slam
+    from terrainloop.slam.run import run_slam
     from terrainloop.slam.submapping import Submapper
 
     terminal = Terminal.open(as_json, quiet, verbose)
@@ -85,7 +86,7 @@ def command(
         paths, cloud_topic=cloud_topic, odometry_topic=odometry_topic, sensor_frame=sensor_frame
     )
     with terminal.progress() as progress:
-        result = slam(
+        result = run_slam(
             recording.scans(),
             settings,
             submapper=Submapper(length, min_range, settings.seed),
@@ -148,8 +149,10 @@ def _draw(result: "SlamRun", true: "Trajectory | None", output: Path) -> list[st
         return []
     from terrainloop.report.figures import figure_mosaic, figure_trajectory, save_figure
 
+    corrected = result.run.corrected
+    ends = np.empty((0, 2, 2)) if corrected is None else corrected.loop_ends
     pictures = {
-        "trajectory.png": figure_trajectory(result.odometry, result.trajectory, result.loop_ends, true),
+        "trajectory.png": figure_trajectory(result.odometry, result.trajectory, ends, true),
         "relief.png": figure_mosaic(result.mosaic),
     }
     for name, figure in pictures.items():

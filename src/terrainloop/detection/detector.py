@@ -117,6 +117,11 @@ class LoopDetector:
         """Patterns fixed to the sensor that were found, in words."""
         return self._patterns.warnings
 
+    @property
+    def cleaned(self) -> dict[str, MapEntry]:
+        """The submaps by id, without the patterns of their sensor: as they are compared."""
+        return {name: self._patterns.cleaned(entry) for name, entry in self.entries.items()}
+
     def __repr__(self) -> str:
         return f"LoopDetector({len(self.entries)} submaps, {len(self.loops)} loops)"
 

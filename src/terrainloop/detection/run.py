@@ -38,7 +38,7 @@ CORRECTED = (POSES, GRAPH)
 """Files of a run whose submaps have odometry."""
 DERIVED = (
     *("precision_recall.csv", "precision_recall_curve.csv", "precision_recall.png"),  # evaluate
-    *("mission.png", "map.png", "match.png"),  # demo
+    *("mission.png", "trajectory.png", "map.png", "match.png"),  # demo
 )
 """Files that other commands add; those of an earlier run are stale."""
 
@@ -157,21 +157,25 @@ class Tally:
     """The loops among pairs, and the number of the others by the first clause of the reason."""
 
     def __init__(self, candidates: Iterable[LoopCandidate] = ()) -> None:
-        self._loops: list[LoopCandidate] = []
-        self._rejections: Counter[str] = Counter()
+        self._loops: dict[tuple[str, str], LoopCandidate] = {}
+        self._rejections: dict[tuple[str, str], str] = {}
         for candidate in candidates:
             self.add(candidate)
 
     def add(self, candidate: LoopCandidate) -> None:
-        """Count one pair."""
+        """Count one pair; a later verdict on a pair takes the place of the one before."""
+        pair = candidate.source, candidate.target
+        self._loops.pop(pair, None)
+        self._rejections.pop(pair, None)
         if candidate:
-            self._loops.append(candidate)
+            self._loops[pair] = candidate
         else:
-            self._rejections[candidate.reason.partition(":")[0]] += 1
+            self._rejections[pair] = candidate.reason.partition(":")[0]
 
     def of(self, run: Run) -> Run:
         """The run with these loops and rejections."""
-        return replace(run, loops=tuple(self._loops), rejections=dict(self._rejections.most_common()))
+        rejections = Counter(self._rejections.values())
+        return replace(run, loops=tuple(self._loops.values()), rejections=dict(rejections.most_common()))
 
 
 class RunWriter:
@@ -184,6 +188,8 @@ class RunWriter:
     def __init__(self, folder: Path, aside: Path) -> None:
         self._folder, self._aside = folder, aside
         self._pairs = LoopFile(aside / PAIRS)
+        self._lines: dict[tuple[str, str], int] = {}  # of the last verdict on each pair
+        self._written = 0
 
     @classmethod
     @contextmanager
@@ -202,9 +208,11 @@ class RunWriter:
                     writer._pairs.close()
 
     def add(self, candidate: LoopCandidate) -> None:
-        """Write one pair."""
+        """Write one pair; a later verdict on a pair takes the place of the one before."""
         with errors_naming(self._folder):
             self._pairs.write(candidate)
+        self._lines[candidate.source, candidate.target] = self._written
+        self._written += 1
 
     def finish(self, run: Run, products: Mapping[str, Callable[[Path], object]] | None = None) -> Run:
         """Write the rest of the run and move all of it into the folder.
@@ -218,6 +226,10 @@ class RunWriter:
         products = products or {}
         with errors_naming(self._folder):
             self._pairs.close()
+            if len(self._lines) < self._written:
+                pairs = enumerate(iterate_loops(self._aside / PAIRS))
+                last = [pair for line, pair in pairs if self._lines[pair.source, pair.target] == line]
+                write_loops(self._aside / PAIRS, last)
             if not run.complete:  # it may have been interrupted between writing a pair and counting it
                 run = Tally(iterate_loops(self._aside / PAIRS)).of(run)
             run = replace(run, folder=self._folder)

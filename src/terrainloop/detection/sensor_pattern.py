@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +21,7 @@ from terrainloop.geometry import Array, inverse, se2, transform, yaw_of
 from terrainloop.gradient_map import GradientMap
 from terrainloop.loop import LoopCandidate
 from terrainloop.matching.overlay import Agreement, agreement_at
+from terrainloop.record import hull_overlap
 
 logger = logging.getLogger(__name__)
 
@@ -320,13 +320,3 @@ def _distance(a: MapEntry, b: MapEntry) -> float:
     if a.record.odometry is None or b.record.odometry is None:
         return np.inf
     return float(np.hypot(*(_middle(a, a.record.odometry) - _middle(b, b.record.odometry))))
-
-
-def hull_overlap(a: Array, b: Array) -> float:
-    """Intersection over union of two convex polygons (K, 2) and (M, 2), anticlockwise, metres, 0 to 1."""
-    if not len(a) or not len(b):
-        return 0.0
-    middle = b.mean(axis=0)  # single precision is enough about it
-    a, b = ((corners - middle).astype(np.float32) for corners in (a, b))
-    shared, _ = cv2.intersectConvexConvex(a, b)
-    return float(shared / max(cv2.contourArea(a) + cv2.contourArea(b) - shared, 1e-30))

@@ -16,6 +16,7 @@ from terrainloop.matching.query import Query
 from terrainloop.matching.refine import Refinement, refine
 from terrainloop.matching.significance import log_num_tests
 from terrainloop.matching.ssd import compute_ssd
+from terrainloop.matching.window import Window
 
 REJECTED_STEP = 3  # every third row and column is enough to describe a rejected pair
 TURNS = 7  # by equal parts of a full turn: only round ground looks the same after each of them
@@ -73,7 +74,9 @@ class Weighed:
         return self.best.surprisal >= self.needed
 
 
-def compare_by_evidence(query: Query, target: MapEntry, pairs: float, settings: Settings) -> LoopCandidate:
+def compare_by_evidence(
+    query: Query, target: MapEntry, pairs: float, settings: Settings, window: Window | None = None
+) -> LoopCandidate:
     """Search, propose, refine; take the hypothesis with the highest surprisal, and decide.
 
     Parameters
@@ -84,8 +87,12 @@ def compare_by_evidence(query: Query, target: MapEntry, pairs: float, settings: 
     pairs : float
         Number of pairs that `max_false_loops` is shared among.
     settings : Settings
+    window : Window, optional
+        Where the two must lie, if they share ground.
     """
     pair = Pair.of(query, target, settings)
+    if window is not None:
+        pair = pair.within(window)
     names = query.entry.name, target.name
     if pair.found.tried == 0:
         area = settings.calibration.min_shared_area * pair.length_scale**2

@@ -1,6 +1,6 @@
 """Hypotheses for the relative pose of two submaps: proposed by the search, refined, weighed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +17,7 @@ from terrainloop.matching.ransac import get_inliers, inlier_radius_of
 from terrainloop.matching.refine import ROUGH, refine
 from terrainloop.matching.search import SearchResult, same_place, search
 from terrainloop.matching.significance import combined_surprisal, surprisal_of_field, surprisal_of_inliers
+from terrainloop.matching.window import Window, search_window
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +65,11 @@ class Pair:
             found=search(query, field, settings.calibration),
             settings=settings,
         )
+
+    def within(self, window: Window) -> "Pair":
+        """The pair, searched only in a window."""
+        fields = self.source_field, self.target_field
+        return replace(self, found=search_window(self.found, *fields, window, self.settings.calibration))
 
     @property
     def maps(self) -> tuple[GradientMap, GradientMap]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -15,6 +16,7 @@ from terrainloop.loop import LoopCandidate
 from terrainloop.matching.by_inliers import compare_by_inliers
 from terrainloop.matching.decision import compare_by_evidence
 from terrainloop.matching.query import Query, RotatedField, rotate, search_grid
+from terrainloop.matching.window import Window
 from terrainloop.record import SubmapRecord
 
 
@@ -62,6 +64,15 @@ def register(
 def compare(source: MapEntry, target: MapEntry, settings: Settings, *, pairs: float = 1) -> LoopCandidate:
     """As `register`, for stored submaps; the parameters are those of `compare_many`."""
     return compare_many(source, [target], settings, pairs=pairs)[0]
+
+
+def compare_within(
+    source: MapEntry, target: MapEntry, window: Window, settings: Settings, *, pairs: float = 1
+) -> LoopCandidate:
+    """Compare two stored submaps only where they must lie, if they share ground."""
+    ((query, _),) = _queries(source, [target], settings)
+    candidate = compare_by_evidence(query, target, pairs, settings, window)
+    return replace(candidate, found_by="second look")
 
 
 def compare_many(

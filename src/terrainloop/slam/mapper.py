@@ -11,14 +11,18 @@ from terrainloop.errors import TerrainLoopError
 from terrainloop.geometry import Array, exp_se3, inverse, log_se3
 from terrainloop.io.trajectories import Trajectory
 from terrainloop.loop import LoopCandidate
-from terrainloop.pose_graph import PoseGraph, Solution
+from terrainloop.matching.mission_warp import with_mission_warp
+from terrainloop.pose_graph import PoseGraph, Solution, require_gtsam
 from terrainloop.record import SubmapRecord
 from terrainloop.scan import PosedScan, Scan
+from terrainloop.slam.second_look import second_look
 from terrainloop.slam.submapping import PosedSubmap, Submapper
 
 logger = logging.getLogger(__name__)
 
 FITTED_SUBMAPS = 3  # first submaps, that the hyperparameters of all maps are fitted on
+FIRST_LOOK = 0.5  # share of max_false_loops
+SECOND_LOOKS = (0.3, 0.15, 0.05)  # shares of the looks that follow
 
 
 class Mapper:
@@ -42,6 +46,8 @@ class Mapper:
         In order; their points are those of `map.ply`.
     solution : Solution or None
         The pose graph since the last loop; None before the first.
+    settings : Settings
+        Half of `max_false_loops` is for the first look, which the detector takes, half for those that follow.
 
     Examples
     --------
@@ -59,11 +65,15 @@ class Mapper:
         on_pair: Callable[[LoopCandidate], object] = lambda candidate: None,
         workers: int = 1,
     ) -> None:
-        self.detector = LoopDetector(settings, on_pair=on_pair, workers=workers)
+        require_gtsam()
+        self.settings = Settings.or_default(settings)
+        allowed = FIRST_LOOK * self.settings.match.max_false_loops
+        self.detector = LoopDetector(self.settings, max_false_loops=allowed, on_pair=on_pair, workers=workers)
+        self._on_pair = on_pair
         self.submaps: list[PosedSubmap] = []
         self.records: list[SubmapRecord] = []
         self.solution: Solution | None = None
-        self._submapper = submapper or Submapper(seed=self.detector.settings.seed)
+        self._submapper = submapper or Submapper(seed=self.settings.seed)
         self._waiting: list[PosedSubmap] = []
         self._stamps: list[float] = []
         self._poses: list[Array] = []
@@ -109,9 +119,9 @@ class Mapper:
         return self._add(self._submapper.add(posed))
 
     def finish(self) -> list[LoopCandidate]:
-        """The loops of what is left at the end of a drive."""
-        loops = self._add(self._submapper.finish())
-        return loops + self._map_waiting()
+        """The loops of what is left at the end of a drive, and those of a second look at all pairs."""
+        loops = self._add(self._submapper.finish()) + self._map_waiting()
+        return loops + self._look_again()
 
     @property
     def odometry(self) -> Trajectory:
@@ -159,8 +169,31 @@ class Mapper:
             self.records.append(entry.record)
             loops += detector.add_entry(entry)
         if loops:
-            self.solution = PoseGraph.of(self.records, detector.loops).solve()
+            self._solve()
         return loops
+
+    def _look_again(self) -> list[LoopCandidate]:
+        """Loops that the corrected trajectory makes plausible, until there are no more."""
+        detector, settings, added = self.detector, self.settings, []
+        if settings.match.decision != "evidence":
+            return []
+        for share in SECOND_LOOKS:
+            if self.solution is None:
+                break
+            candidates = second_look(detector.cleaned, self.solution, settings, share)
+            for candidate in candidates:
+                self._on_pair(candidate)
+            loops = [candidate for candidate in candidates if candidate]
+            if not loops:
+                break
+            detector.loops += loops
+            added += loops
+            self._solve()
+        return added
+
+    def _solve(self) -> None:
+        loops = with_mission_warp(self.detector.loops, self.detector.settings.calibration)
+        self.solution = PoseGraph.of(self.records, loops).solve()
 
 
 def _corrected(odometry: Trajectory, stamps: Array, before: Array, after: Array) -> Array:

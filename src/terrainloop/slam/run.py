@@ -69,15 +69,6 @@ class SlamRun:
         return float(np.linalg.norm(moved, axis=1).max(initial=0.0))
 
     @property
-    def loop_ends(self) -> Array:
-        """Positions (L, 2, 2) of source and target of each loop in the world, corrected: (x, y), metres."""
-        corrected = self.run.corrected
-        if corrected is None:
-            return np.empty((0, 2, 2))
-        edges = corrected.graph.edges[corrected.kept]
-        return self.poses[edges, :2, 3]
-
-    @property
     def points(self) -> Array:
         """Points (N, 3) of all submaps in the world."""
         moved = [transform(T, posed.submap.points) for T, posed in zip(self.poses, self.submaps, strict=True)]
@@ -89,7 +80,7 @@ class SlamRun:
         return mosaic([entry.gradient_map for entry in self.run.entries.values()], self.poses)
 
 
-def slam(
+def run_slam(
     scans: Iterable[PosedScan],
     settings: Settings | None = None,
     *,
