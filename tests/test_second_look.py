@@ -10,6 +10,7 @@ from terrainloop.config import Settings
 from terrainloop.entry import MapEntry
 from terrainloop.geometry import inverse, se2, se3, transform, yaw_of
 from terrainloop.loop import LoopCandidate
+from terrainloop.matching.mission_null import MissionNull, by_mission_null, mirrored
 from terrainloop.matching.register import compare, compare_within
 from terrainloop.matching.window import Window
 from terrainloop.pose_graph import PoseGraph
@@ -71,18 +72,23 @@ def test_outside_of_its_window_nothing_is_found():
     assert not compare_within(source, target, elsewhere, SETTINGS)
 
 
-def test_unrelated_ground_scores_as_promised_in_a_window():
+def test_mirror_images_show_what_chance_does_in_a_window():
     rng = np.random.default_rng(0)
-    entries = [entry_at(f"{k}", 0, 0, 0, world=k) for k in range(12)]
-    scores = []
-    for i, source in enumerate(entries):
+    entries = [entry_at(f"{k}", 0, 0, 0, world=k) for k in range(14)]
+    images = [mirrored(entry, SETTINGS) for entry in entries]
+    unrelated, by_mirrors = [], []
+    for i in range(14):
         for target in entries[:i]:
             window = Window(se2(*rng.uniform(-1.5, 1.5, 2), rng.uniform(-3, 3)), 0.5, 0.05)
-            scores.append(compare_within(source, target, window, SETTINGS).score)
-    scores = np.array(scores)
-    assert np.mean(scores > 1) < 0.25
-    assert np.mean(scores > 2) < 0.06
-    assert scores.max() < 4
+            unrelated.append(compare_within(entries[i], target, window, SETTINGS))
+            by_mirrors.append(-compare_within(images[i], target, window, SETTINGS).log_nfa)
+    null = MissionNull.of(by_mirrors, SETTINGS.calibration)
+    decided = [by_mission_null(pair, null, SETTINGS, len(unrelated)) for pair in unrelated]
+    scores = np.array([pair.score for pair in decided])
+    assert np.mean(scores > 1) < 0.2
+    assert np.mean(scores > 2) < 0.05
+    assert scores.max() < 3
+    assert not any(decided)
 
 
 # --- a mission
@@ -100,7 +106,8 @@ def mission():
         place = 20.0 * round(x / 20)
         entries[f"{k}"] = entry_at(f"{k}", x - place, y, yaw, world=int(place), odometry=poses[k])
     loops = [known(poses, source, target) for source, target in ((3, 2), (4, 1))]
-    return entries, PoseGraph.of([entry.record for entry in entries.values()], loops).solve()
+    steps = np.tile(np.diag([0.002, 0.002, 0.004, 0.03, 0.03, 0.03]) ** 2, (len(PLACES), 1, 1))
+    return entries, PoseGraph.of([entry.record for entry in entries.values()], loops, steps).solve()
 
 
 def known(poses, source, target):

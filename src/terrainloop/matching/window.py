@@ -44,10 +44,14 @@ class Window:
         ]
 
     def tried(self, source: Field, calibration: Calibration) -> float:
-        """Number of poses in the units of `SearchResult.tried`."""
+        """Number of poses in the units of `SearchResult.tried`, as many as make each of them count.
+
+        Neighbours among all poses are alike, which `independent_tests` allows for; in a window of few of
+        them the best is refined, and each counts as a test (docs/slam.md).
+        """
         arc = 2 * self.rotation * source.radius / source.spacing
         area = (2 * self.shift / source.length_scale) ** 2
-        return max(arc / calibration.rotation_step, 1.0) * max(area, 1.0)
+        return max(arc / calibration.rotation_step, 1.0) * max(area, 1.0) / calibration.independent_tests
 
 
 def search_window(
