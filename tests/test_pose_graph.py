@@ -168,7 +168,16 @@ def test_where_half_of_the_loops_are_wrong_the_result_is_not_worse_than_odometry
 
 def test_without_loops_the_poses_are_those_of_odometry():
     _, graph = mission(0, good=0)
-    np.testing.assert_array_equal(graph.solve().poses, graph.odometry)
+    solution = graph.solve()
+    np.testing.assert_array_equal(solution.poses, graph.odometry)
+    assert solution.loop_ends.shape == (0, 2, 2)
+
+
+def test_ends_of_loops_are_where_their_submaps_are(solved):
+    _, graph, solution = solved
+    loop = graph.loops[0]
+    expected = [solution.poses[int(name), :2, 3] for name in (loop.target, loop.source)]
+    np.testing.assert_array_equal(solution.loop_ends[0], expected)
 
 
 def test_submaps_without_odometry_are_no_part_of_it():

@@ -129,7 +129,8 @@ class PoseGraph:
     def edges(self) -> NDArray[np.intp]:
         """Indices (L, 2) of target and source of each loop."""
         index = {name: k for k, name in enumerate(self.names)}
-        return np.array([(index[loop.target], index[loop.source]) for loop in self.loops]).reshape(-1, 2)
+        pairs = [(index[loop.target], index[loop.source]) for loop in self.loops]
+        return np.array(pairs, dtype=np.intp).reshape(-1, 2)
 
     @cached_property
     def chained(self) -> NDArray[np.bool_]:
