@@ -15,7 +15,7 @@ from terrainloop.simulation.drives import simulate_drive, trajectories, write_sc
 
 @pytest.fixture(scope="module")
 def drive():
-    return simulate_drive("etna", 3, length=21.0, max_points=600)
+    return simulate_drive("etna", 3, length=25.0, sensor="lidar", max_points=600)
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def test_scans_lie_on_the_terrain_from_the_true_poses(drive, scans):
     for posed, T in list(zip(scans, truth, strict=True))[::5]:
         world = transform(T, posed.scan.points)
         error = np.abs(world[:, 2] - drive.terrain.height_at(world[:, :2]))
-        assert np.median(error) < 0.03
+        assert np.median(error) < 0.06
         assert len(world) == 600
 
 
@@ -36,13 +36,13 @@ def test_scans_are_the_same_at_every_call(drive, scans):
     again = next(iter(drive.scans()))
     np.testing.assert_array_equal(again.scan.points, scans[0].scan.points)
     assert [posed.scan.stamp for posed in scans] == drive.stamps.tolist()
-    assert np.diff(drive.stamps) == pytest.approx(1.0)  # half a metre, half a metre per second
+    assert np.diff(drive.stamps) == pytest.approx(2.0)  # a metre, half a metre per second
 
 
 def test_odometry_begins_at_the_truth_and_drifts(drive):
     np.testing.assert_allclose(drive.odometry[0], drive.truth[0], atol=1e-9)
-    assert drive.length == pytest.approx(21.0, rel=0.05)
-    off = [simulate_drive("flat", seed, length=140.0).off_at_the_end / 140.0 for seed in range(8)]
+    assert drive.length == pytest.approx(25.0, rel=0.1)
+    off = [simulate_drive("flat", seed, length=100.0).off_at_the_end / 100.0 for seed in range(5)]
     assert 0.004 < np.sqrt(np.mean(np.square(off))) < 0.03
 
 
