@@ -111,3 +111,10 @@ def test_scans_without_ground_make_no_submap(caplog):
     few = [PosedScan(Scan(np.random.default_rng(0).uniform(1, 2, (20, 3)), 0.0), T)]
     assert submaps_of(few) == []
     assert "no submap of 1 scans" in caplog.text
+
+
+def test_clouds_of_a_mission_are_submaps_already():
+    scans = list(straight(3.0, step=1.0))
+    submaps = submaps_of(scans, each_scan=True)
+    assert [len(posed.submap) for posed in submaps] == [len(posed.scan) for posed in scans]
+    assert [posed.submap.stamp for posed in submaps] == [posed.scan.stamp for posed in scans]

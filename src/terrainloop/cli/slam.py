@@ -73,7 +73,7 @@ def command(
     verbose: Verbose = False,
 ) -> None:
     """Run ``terrainloop slam``."""
-    from terrainloop.io.recordings import open_recording
+    from terrainloop.io.recordings import MISSION_KIND, open_recording
     from terrainloop.io.trajectories import read_trajectory
     from terrainloop.slam.run import run_slam
     from terrainloop.slam.submapping import Submapper
@@ -89,7 +89,7 @@ def command(
         result = run_slam(
             recording.scans(),
             settings,
-            submapper=Submapper(length, min_range, settings.seed),
+            submapper=Submapper(length, min_range, settings.seed, each_scan=recording.kind == MISSION_KIND),
             output=output,
             workers=worker_count(workers),
             on_progress=progress,

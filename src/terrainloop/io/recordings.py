@@ -17,6 +17,9 @@ logger = logging.getLogger(__name__)
 Sensor = Literal["lidar", "stereo", "unknown"]
 PathOrPaths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
+MISSION_KIND = "mission of submaps"
+"""Of a recording whose scans are submaps already."""
+
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 """Suffixes, in lower case, of the files of ROS bags."""
 

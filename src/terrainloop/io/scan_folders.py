@@ -17,7 +17,15 @@ from terrainloop.io.gravity import T_BODY_OPTICAL, why_not_upright
 from terrainloop.io.missions import CLOUDS, load_mission
 from terrainloop.io.ordering import order_of_names, times_in_names
 from terrainloop.io.pose_track import PoseTrack
-from terrainloop.io.recordings import Description, Missing, Recording, Sensor, Stream, no_scans
+from terrainloop.io.recordings import (
+    MISSION_KIND,
+    Description,
+    Missing,
+    Recording,
+    Sensor,
+    Stream,
+    no_scans,
+)
 from terrainloop.io.trajectories import Trajectory, read_trajectory
 from terrainloop.scan import PosedScan, Scan
 
@@ -31,7 +39,6 @@ _TEXTS = (".txt", ".csv")  # in the folder itself these hold trajectories and no
 _TIMES, _CALIBRATION = "times.txt", "calib.txt"
 _SHORTEST_STEP = 1e-3  # seconds between two scans
 _LARGEST_TEXT = 64 << 20  # bytes
-_MISSION_KIND = "mission of submaps"
 _NO_ODOMETRY = Missing("no odometry.tum, which 'terrainloop slam' needs", "write one pose for each submap")
 _OUTSIDE = "outside the time span of the poses, or in a gap of them"
 
@@ -81,7 +88,7 @@ def _mission_of(folder: Path) -> Recording | None:
     streams = (_clouds_stream(posed, "submaps"), *(_poses_stream(*item) for item in trajectories.items()))
     remarks = ("every cloud is a submap: 'terrainloop detect' takes it as it is",)
     missing = () if mission.odometry is not None else (_NO_ODOMETRY,)
-    description = Description(_MISSION_KIND, str(folder), streams, remarks, missing)
+    description = Description(MISSION_KIND, str(folder), streams, remarks, missing)
     return Recording(description, "unknown", len(mission), partial(_posed_scans, posed, np.eye(4)))
 
 

@@ -56,11 +56,14 @@ class Submapper:
         Metres: what is nearer to the sensor is the vehicle.
     seed : int
         Of the points that are drawn where there are too many.
+    each_scan : bool
+        Whether each scan is a submap already, as the clouds of a mission are.
     """
 
     length: float | None = None
     min_range: float = 0.5
     seed: int = 0
+    each_scan: bool = False
     _count: int = 0
     _reaches: list[float] = field(default_factory=list)
     _scans: list[PosedScan] = field(default_factory=list)
@@ -70,6 +73,10 @@ class Submapper:
 
     def add(self, posed: PosedScan) -> PosedSubmap | None:
         """The submap that ends before this scan, if one does."""
+        if self.each_scan:
+            finished = self.finish()
+            self._scans, self._points = [posed], [transform(posed.T_world_sensor, posed.scan.points)]
+            return finished
         points = self._usable(posed)
         if not len(points):
             return None
